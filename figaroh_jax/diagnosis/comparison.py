@@ -34,6 +34,7 @@ __all__ = [
 ]
 
 
+MOST = 10.0  # times the median size of the blocks' differences: what a gain counts for at the most
 TINY = 1e-12  # of the diagonal: the rounding of columns that nothing excites
 
 
@@ -265,10 +266,15 @@ def _block_squares(rows: Rows, error: Float[np.ndarray, "nv T"]) -> Float[np.nda
 
 
 def t_value(worse: Float[np.ndarray, " blocks"], better: Float[np.ndarray, " blocks"]) -> float:
-    """Student t of the blocks' differences: how surely `better` predicts better."""
+    """Student t of the blocks' differences: how surely `better` predicts better.
+
+    One block that gains far more than all others must not make what they all say less sure: it is the larger t of the
+    differences and of those that count up to `MOST` times their median size.
+    """
     gain = worse - better
-    spread = gain.std(ddof=1) / np.sqrt(len(gain))
-    return float(gain.mean() / spread) if spread > 0 else 0.0
+    gains = np.stack([gain, np.minimum(gain, MOST * np.median(np.abs(gain)))])
+    spread = gains.std(axis=1, ddof=1) / np.sqrt(len(gain))
+    return float(np.max(np.where(spread > 0, gains.mean(1) / np.where(spread > 0, spread, 1.0), 0.0)))
 
 
 def t_needed(blocks: int, t: float, tried: int = 1) -> float:

@@ -19,6 +19,7 @@ from .believed import believed
 from .comparison import Ground, Hypothesis, Verdicts, grown_sums, judge, judge_grown, last_coefficient, sums_of
 from .design import BATCH, kind, shapes, unit_rows, units, with_shape
 from .estimates import torque_slope
+from .joint import polished
 from .problem import Problem
 from .refit import Whitened, refit, refit_shift
 from .screening import Group, Screen
@@ -57,6 +58,7 @@ def shortlist(step: Step, found: Screen) -> list[tuple[Group, np.ndarray, float]
     chosen = [r for r in ranked[:SHORTLIST] if r[0] > SHARE_OF_BEST * ranked[0][0]] or ranked[:1]
     chosen += [r for r in _best_of_places(step, found, ranked) if r not in chosen]
     chosen += [r for r in _read_alike(found, everything, chosen) if r not in chosen]
+    chosen += [r for r in _cut_off(step, found, ranked) if r not in chosen]
     simpler = {Name(n, found.groups[g].name.at) for _, g, _ in chosen for n in type(found.groups[g].effect).contains}
     chosen += [r for r in ranked if found.groups[r[1]].name in simpler and r not in chosen]
     return [(found.groups[g], np.argsort(-found.scores[g].Q), float(found.scores[g].Q[p])) for _, g, p in chosen]
@@ -78,13 +80,30 @@ def _read_alike(
 def _best_of_places(step: Step, found: Screen, ranked: list[tuple[float, int, int]]) -> list[tuple[float, int, int]]:
     """The best of each joint, pair, link and of the robot whose score could pass for a gain there."""
     squares, places = (step.verdicts.error**2).sum(1), {}
-    for rank, group, point in ranked:
-        one = found.groups[group]
-        least = 0.5 * GAIN * squares[list(acting(one.effect, len(squares), one.columns.joints))].sum()
-        if rank > 0 and found.scores[group].Q[point] > least:
-            places.setdefault(one.name.at, []).append((rank, group, point))
+    for one in ranked:
+        if _could_gain(squares, found, one):
+            places.setdefault(found.groups[one[1]].name.at, []).append(one)
     best = (own[:BEST_OF_A_PLACE] for own in places.values())
     return [r for own in best for r in own if r[0] > SHARE_OF_BEST * own[0][0]]
+
+
+def _cut_off(step: Step, found: Screen, ranked: list[tuple[float, int, int]]) -> list[tuple[float, int, int]]:
+    """The limits of drives whose score could pass for a gain.
+
+    Where a drive is often at its limit, the torque that it was to give is not known: that of a fit to what it gave
+    passes the limit little, and the limit's score is small beside those of frictions that bend as the torque does.
+    """
+    squares = (step.verdicts.error**2).sum(1)
+    limits = [r for r in ranked if found.groups[r[1]].effect.has("through")]
+    return [r for r in limits if _could_gain(squares, found, r)]
+
+
+def _could_gain(squares: Float[np.ndarray, " nv"], found: Screen, one: tuple[float, int, int]) -> bool:
+    """Whether a candidate's score could pass for a gain at its joints; `squares` are those of each joint's errors."""
+    rank, index, point = one
+    group = found.groups[index]
+    own = squares[list(acting(group.effect, len(squares), group.columns.joints))].sum()
+    return rank > 0 and bool(found.scores[index].Q[point] > 0.5 * GAIN * own)
 
 
 def acting(effect: Effect, nv: int, touched: Sequence[int]) -> tuple[int, ...]:
@@ -118,6 +137,8 @@ def contend(
         one = _position_contender(problem, step, base, ready, group, fitted.get(group.name))
         fitted[group.name] = one.effect
         return one
+    if group.effect.has("through"):
+        return _limit_contender(problem, step, whitening, group, order)
     if group.effect.about:
         return _expanded_contender(problem, step, base, ready, group)
     parts = None
@@ -289,6 +310,16 @@ def _position_contender(
     held = prior if loose is None else believed(problem, loose, sums)
     verdicts = judge(rows, Hypothesis(rows.X, held, change), sums)
     return Contender(group.name, effect, verdicts, acting(effect, len(rows.y), group.columns.joints), free)
+
+
+def _limit_contender(
+    problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group, order: np.ndarray
+) -> Contender:
+    """A drive at its limit, all coefficients fitted with it: where it holds, the torque says nothing of them."""
+    effect = with_shape(jax.tree.map(lambda x: x[order[0]], group.effect), group.effect.amplitudes(), [np.float64(1.0)])
+    joint = polished(problem, step.state, [effect], whitening)
+    joints = acting(effect, len(step.rows.y), group.columns.joints)
+    return Contender(group.name, joint.causes[0], joint.step.verdicts, joints, step.loose and joint.step.free)
 
 
 def _expanded_contender(problem: Problem, step: Step, base: Ground, ready: Whitened, group: Group) -> Contender:

@@ -114,10 +114,14 @@ def _moves(
     own: Float[np.ndarray, "P P"], other: Float[np.ndarray, "P P"], move: Float[np.ndarray, " P"]
 ) -> Float[np.ndarray, "P P"]:
     """Squares of what another fit moves, as far as it is as sure."""
-    share = AS_SURE**2 * np.diag(own) / np.maximum(np.diag(other), 1e-300)
-    move = np.sqrt(np.clip(share, 0.0, 1.0)) * move
+    move = np.sqrt(_as_sure(own, other)) * move
     move = np.where(np.isfinite(move), move, 0.0)  # a fit without rows of a joint says nothing of it
     return np.outer(move, move)
+
+
+def _as_sure(own: Float[np.ndarray, "P P"], other: Float[np.ndarray, "P P"]) -> Float[np.ndarray, " P"]:
+    """How far the values of another fit count, 1 up to `AS_SURE` times the deviation. Both are covariances."""
+    return np.clip(AS_SURE**2 * np.diag(own) / np.maximum(np.diag(other), 1e-300), 0.0, 1.0)
 
 
 def _at_shapes(causes: Sequence[Effect], fitted: Fitted) -> Float[np.ndarray, "P P"]:
@@ -143,7 +147,8 @@ def with_parts(problem: Problem, joint: Joint, whitening: Float[np.ndarray, "F n
 
     Parts are excitations, or quarters of recordings: what a model leaves goes on for longer than a block of the scores,
     and pulls the values another way in each of them. To first order, with v_k the values without part k of K:
-    variance = (K - 1) / K sum_k (v_k - their mean)^2.
+    variance = (K - 1) / K sum_k (v_k - their mean)^2. Without the one part that shows a value (a limit that a single
+    excitation reaches) the others say nothing of it: such a v_k counts as far as it is as sure.
     """
     step, fitted, state = joint.step, joint.fitted, joint.step.state
     rows = step.rows._replace(fold=problem.layout.part)
@@ -154,9 +159,10 @@ def with_parts(problem: Problem, joint: Joint, whitening: Float[np.ndarray, "F n
     count = len(sums.gram)
     if count < 2:
         return joint
-    A = sums.gram.sum(0) + np.diag(np.append(state.prior.precision, np.zeros(len(slopes)))) - sums.gram
-    diagonal = np.maximum(np.diagonal(A, axis1=1, axis2=2), KEPT)
-    moves = np.linalg.solve(A + KEPT * diagonal[:, None] * np.eye(A.shape[1]), sums.moment[..., None])[..., 0]
+    A = sums.gram.sum(0) + np.diag(np.append(state.prior.precision, np.zeros(len(slopes))))
+    inverse = [_inverse(A - own) for own in sums.gram]
+    share = np.array([_as_sure(_inverse(A), other) for other in inverse])
+    moves = np.sqrt(share) * (np.stack(inverse) @ sums.moment[..., None])[..., 0]
     variance = (count - 1) / count * ((moves - moves.mean(0)) ** 2).sum(0)
     return joint._replace(fitted=_wider(fitted, variance / np.maximum(np.diag(fitted.covariance), 1e-300)))
 

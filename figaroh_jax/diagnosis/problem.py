@@ -116,6 +116,13 @@ class Part:
 
         return cls(make, (len(motion[0]), model.nv, 10 * len(model.joints)), quick)
 
+    def times(self, factor: Float[np.ndarray, " nN"], joint: int) -> Part:
+        """The columns of one joint, each sample times a factor; the other joints' are zero."""
+        made = self._columns
+        own = slice(*np.searchsorted(made.joint, (joint, joint + 1)).tolist())
+        some = _Columns(made.series[own] * factor, made.joint[own], made.column[own])
+        return Part(lambda: some, (self.samples, self.nv, self.width))
+
     def torque(self, theta: Float[np.ndarray, " k"], rows: slice = slice(None)) -> Float[np.ndarray, "rows nv"]:
         """Torque (samples, nv) of the coefficients `theta`, N m or N; `rows` are samples."""
         if rows != slice(None):

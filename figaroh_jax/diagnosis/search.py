@@ -391,7 +391,7 @@ def judged_without(
     problem: Problem, start: State, full: Step, found: list[Found], one: Found, whitening: Float[np.ndarray, "F nv"]
 ) -> Verdicts:
     """What the data say of all causes but one."""
-    if kind(one.effect) != "columns":
+    if kind(one.effect) != "columns" or one.effect.has("through"):
         about = start, whitening, *(f.effect for f in found if f is not one)
         known = problem.judged.get(*about)
         return known or problem.judged.put(stood_without(problem, start, found, one, whitening).verdicts, *about)

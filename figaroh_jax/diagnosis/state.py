@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -47,7 +47,15 @@ __all__ = [
     "with_term",
 ]
 
-FRICTION_PRECISION = 1e-6  # 1/(N m)^2: friction is as good as free
+FREE = 0.0, 1e3  # value and deviation before any data, N m: an amplitude is as good as free
+FRICTION_PRECISION = FREE[1] ** -2  # 1/(N m)^2
+
+
+class Cut(NamedTuple):
+    """What drives at their limit make of the torque, to first order about the one that they were to give."""
+
+    through: Float[np.ndarray, "nN nv"]  # of a change of that torque
+    torque: Float[np.ndarray, "nN nv"]  # of that torque, what no change moves, N m or N
 
 
 @dataclass(frozen=True)
@@ -61,6 +69,7 @@ class State:
     theta: Float[np.ndarray, " P"]
     measured: Motion  # as measured, with the nominal robot's load
     carried: Float[np.ndarray, "n links 10"] | None = None  # known bodies on the links of each recording
+    cut: Cut | None = None
 
     @cached_property
     def motion(self) -> Motion:
@@ -76,6 +85,11 @@ class State:
 
     @cached_property
     def known(self) -> Float[np.ndarray, "nN nv"]:
+        """Torque that no coefficient moves, N m or N: of what recordings carry, and of drives at their limit."""
+        return self._carried if self.cut is None else self.cut.through * self._carried + self.cut.torque
+
+    @cached_property
+    def _carried(self) -> Float[np.ndarray, "nN nv"]:
         """Torque of what each recording is known to carry, N m or N."""
         if self.carried is None:
             return np.zeros((self.rigid.samples, self.rigid.nv))
@@ -91,14 +105,21 @@ class State:
     def _load(self, theta: Float[np.ndarray, " P"], rows: slice = slice(None)) -> Float[np.ndarray, "rows nv"]:
         """Torque of the rigid body with what it carries."""
         torque = self.rigid.torque(theta[: self.rigid.width], rows)
-        return torque if self.carried is None else torque + self.known[rows]
+        return torque if self.carried is None else torque + self._carried[rows]
 
     def _total(
         self, load: Float[np.ndarray, "rows nv"], theta: Float[np.ndarray, " P"], rows: slice = slice(None)
     ) -> Float[np.ndarray, "rows nv"]:
-        """The load with the torque of each term."""
-        total = load.copy()
-        for part, own in zip(self.parts[1:], self._of_terms(theta), strict=True):
+        """The load with the torque of each term; what cuts it comes last."""
+        total, cutting = load.copy(), []
+        for term, part, own in zip(self.terms, self.parts[1:], self._of_terms(theta), strict=True):
+            if self.cut is not None and term.has("through"):
+                cutting.append((part, own))
+            else:
+                part.add(own, total, rows)
+        if self.cut is not None:
+            total = self.cut.through[rows] * total + self.cut.torque[rows]
+        for part, own in cutting:
             part.add(own, total, rows)
         return total
 
@@ -143,13 +164,29 @@ def with_term(problem: Problem, state: State, term: Effect) -> State:
     """The state with one more effect (leading axis of places) whose torque is linear in its amplitudes."""
     own = _term_columns(problem, state, term)
     count = own.width
-    mean, precision = np.zeros(count), np.full(count, FRICTION_PRECISION)
+    known = [parameter.expected or FREE for parameter in term.parameters().values() if parameter.linear]
+    mean, deviation = np.resize(known or FREE, (count, 2)).T
+    precision = deviation**-2.0
     if term.body:
         mean = np.array([float(getattr(term, name)[0]) for name in term.parameters()])
         precision = body_precision(mean)
     prior = Prior(np.append(state.prior.mean, mean), np.append(state.prior.precision, precision))
     theta = np.append(state.theta, np.zeros(count))
-    return replace(state, terms=(*state.terms, term), parts=(*state.parts, own), prior=prior, theta=theta)
+    grown = replace(state, terms=(*state.terms, term), parts=(*state.parts, own), prior=prior, theta=theta)
+    return replace(grown, cut=_cut_by(state, term))
+
+
+def _cut_by(state: State, term: Effect) -> Cut | None:
+    """What the drives of a state make of the torque once a term is in."""
+    if not term.has("through"):
+        return state.cut
+    total = state.motion.total
+    through, torque = (np.ones_like(total), np.zeros_like(total)) if state.cut is None else map(np.copy, state.cut)
+    for k, joint in enumerate(np.asarray(term.at)[:, 0].tolist()):
+        one = jax.tree.map(lambda x, k=k: np.asarray(x)[k], term)
+        through[:, joint] = one.through(state.motion)
+        torque[:, joint] = (1 - through[:, joint]) * total[:, joint]
+    return Cut(through, torque)
 
 
 def extended_state(problem: Problem, state: State, effect: Effect) -> State:
@@ -228,7 +265,8 @@ def on_motion(problem: Problem, state: State) -> State:
     for term in state.terms:
         own = _term_columns(problem, here, term)
         theta = state.theta[: len(here.theta) + own.width]
-        here = replace(here, terms=(*here.terms, term), parts=(*here.parts, own), theta=theta)
+        cut = _cut_by(here, term)
+        here = replace(here, terms=(*here.terms, term), parts=(*here.parts, own), theta=theta, cut=cut)
     return here
 
 
@@ -246,11 +284,12 @@ def with_width(problem: Problem, state: State) -> State:
         np.zeros(part.width) if t.follows_total else own
         for (t, part), own in zip(pairs, moved._of_terms(state.theta), strict=True)
     ]
-    alone = replace(moved, theta=np.concatenate([state.theta[: state.rigid.width], *others]))
-    parts = [
-        _term_columns(problem, alone, t) if t.follows_total else own for t, own in zip(state.terms, parts, strict=True)
-    ]
-    return replace(moved, parts=(state.rigid, *parts))
+    alone = replace(moved, theta=np.concatenate([state.theta[: state.rigid.width], *others]), cut=None)
+    parts, cut = [], None
+    for term, own in zip(state.terms, moved.parts[1:], strict=True):
+        cut = _cut_by(replace(alone, cut=cut), term) if term.follows_total else cut
+        parts.append(_term_columns(problem, alone, term) if term.follows_total else own)
+    return replace(moved, parts=(state.rigid, *parts), cut=cut)
 
 
 def link_motion(problem: Problem, state: State) -> Motion:
@@ -370,10 +409,25 @@ def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"
     response = whitening * state.response(problem.records.omega)[:, None]
     y = _unexplained(problem, state, whitening, response)
     X = problem.filtered.rows(problem.records, state.parts, response)
+    X = X if state.cut is None else _cut_rows(problem, state, X, response)
     Xi = X
     if layout.repeats:
         Xi = np.stack([instruments(x.T, layout.partner, p).T for x, p in zip(X, layout.paired, strict=True)])
     return Rows(y, X, np.ascontiguousarray(Xi), *_row_layout(layout))
+
+
+def _cut_rows(
+    problem: Problem, state: State, X: Float[np.ndarray, "nv T P"], response: Complex[np.ndarray, "F nv"]
+) -> Float[np.ndarray, "nv T P"]:
+    """The rows with those of the joints whose drives are at their limit at times as these let them through."""
+    assert state.cut is not None
+    X, through = X.copy(), state.cut.through
+    for joint in np.flatnonzero((through != 1).any(0)).tolist():
+        factor = through[:, joint]
+        whole = [False, *(term.has("through") for term in state.terms)]
+        parts = [p.times(np.ones_like(factor) if w else factor, joint) for w, p in zip(whole, state.parts, strict=True)]
+        X[joint] = problem.filtered.rows(problem.records, parts, response)[joint]
+    return X
 
 
 def plain_rows(problem: Problem, state: State) -> Rows:
@@ -384,9 +438,11 @@ def plain_rows(problem: Problem, state: State) -> Rows:
 def _unexplained(
     problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], response: Complex[np.ndarray, "F nv"]
 ) -> Float[np.ndarray, "nv T"]:
-    """Rows of the measured torque, less what the sensors read of a known load."""
+    """Rows of the measured torque, less what the sensors read of a known one."""
     rows = problem.filtered.rows(problem.records, [problem.read], whitening)[..., 0]
-    return rows if state.carried is None else rows - filtered_rows(problem.records, state.known, response)
+    if state.carried is None and state.cut is None:
+        return rows
+    return rows - filtered_rows(problem.records, state.known, response)
 
 
 def _row_layout(layout: Layout) -> tuple[np.ndarray, ...]:

@@ -53,7 +53,8 @@ def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], 
     `before` is where the search stood when this state has grown out of it.
     """
     rows = whitened(problem, state, whitening)
-    if before is not None and len(before.state.sensors) == len(state.sensors):
+    same = before is not None and len(before.state.sensors) == len(state.sensors) and before.state.cut is state.cut
+    if before is not None and same:
         folded = grown_sums(rows, before.folded, rows.X[:, :, before.folded.moment.shape[1] :])
     else:
         folded = problem.filtered.sums(rows)

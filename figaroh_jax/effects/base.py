@@ -71,6 +71,7 @@ class Parameter(NamedTuple):
     grid: tuple[float, ...] = ()
     choice: bool = False  # one of the grid's values, never anything between (a sign)
     hole: tuple[float, float] | None = None  # values that are another effect
+    expected: tuple[float, float] | None = None  # of an amplitude: its value before any data, and its deviation
 
 
 class Native(NamedTuple):
@@ -173,8 +174,12 @@ def changed(module: T, **fields: Any) -> T:
     return other
 
 
-def amplitude(unit: str, lower: float = -np.inf, upper: float = np.inf) -> Any:
+def amplitude(
+    unit: str, lower: float = -np.inf, upper: float = np.inf, expected: tuple[float, float] | None = None
+) -> Any:
     """Declare a parameter in which the torque is linear; outside of its bounds the effect is not one that exists.
+
+    `expected` are its value before any data and the deviation of that; without them any size is as likely.
 
     >>> import figaroh_jax as fj
     >>> class Drag(fj.Effect):
@@ -186,7 +191,7 @@ def amplitude(unit: str, lower: float = -np.inf, upper: float = np.inf) -> Any:
     >>> Drag.parameters()["drag"].unit
     'N m s2/rad2'
     """
-    return eqx.field(default=0.0, metadata={"parameter": Parameter(unit, True, lower, upper)})
+    return eqx.field(default=0.0, metadata={"parameter": Parameter(unit, True, lower, upper, expected=expected)})
 
 
 def shape(
@@ -345,6 +350,10 @@ class Effect(eqx.Module):
     def delivered(self, torque: Float[Array, " nv"]) -> Float[Array, " nv"]:
         """What the drives give of the torques that they are to give, N m or N."""
         return torque
+
+    def through(self, motion: Motion) -> Float[Leaf, " samples"]:
+        """What is left, at the joint where it acts, of a small change of all torque together (`follows_total`)."""
+        raise NotImplementedError(f"{self.name} leaves the torque as it is")
 
     def step(self, velocity: Float[Array, " nv"], dt: Float[Array, ""]) -> Effect:
         """The effect with its state after `dt` seconds at a velocity, for effects that have a state (`memory`)."""

@@ -104,7 +104,8 @@ class TorqueSaturation(JointEffect):
     follows_torque = follows_total = True
     equation = "clip(tau_hat, -limit, limit) - tau_hat"
     separated_by = "motion of {at} at two larger accelerations: the largest torque stays"
-    share: Scalar = amplitude("", lower=0.5, upper=2.0)  # of what lies above the limit; 1 where nothing passes
+    # of what lies above the limit; 1 where nothing passes, which is expected where few samples lie there
+    share: Scalar = amplitude("", lower=0.5, upper=2.0, expected=(1.0, 1.0))
     limit: Scalar = shape("N m", (1.0, 3.0, 10.0, 30.0, 100.0, 300.0), (0.0, 1e5))
 
     def torque_error(self, motion: Motion) -> Float[Array, " samples"]:
@@ -116,6 +117,10 @@ class TorqueSaturation(JointEffect):
         """The torques (nv,) with this joint's cut at its limit, N m or N."""
         own = torque[self.at[0]]
         return torque.at[self.at[0]].add(self.share * (jnp.clip(own, -self.limit, self.limit) - own))
+
+    def through(self, motion: Motion) -> Float[Leaf, " samples"]:
+        """1 below the limit, 1 - share beyond it: there the torque says nothing of what the drive was to give."""
+        return np.where(np.abs(np.asarray(self.here(motion.total))) > self.limit, 1 - self.share, 1.0)
 
     def physical(self) -> dict[str, Scalar]:
         """The limit alone: the share is 1 where a drive is saturated."""
