@@ -131,6 +131,20 @@ def test_t_value_is_that_of_the_paired_test() -> None:
     assert t_value(worse, worse) == 0.0
 
 
+def test_a_block_that_gains_far_more_than_all_others_makes_none_of_them_less_sure() -> None:
+    rng = np.random.default_rng(6)
+    gain = rng.normal(0.5, 0.5, 36)
+    sure = t_value(gain, np.zeros(36))
+    gain[0] = 200.0
+    assert t_value(gain, np.zeros(36)) > 0.5 * sure > 2.0
+    alone = rng.normal(0.0, 0.5, 36)
+    alone[0] = 200.0
+    assert t_value(alone, np.zeros(36)) < 1.6  # one block that others do not bear out
+    null = rng.laplace(size=(4000, 36)) ** 3  # symmetric, with tails that make some blocks far larger than the others
+    exceeded = np.mean([t_value(one, np.zeros(36)) > 1.69 for one in null])  # 5 % of Student's t with 35 degrees
+    assert exceeded < 0.06
+
+
 def test_overlap_is_one_for_the_same_change_and_zero_for_another() -> None:
     rng = np.random.default_rng(5)
     X = np.linalg.qr(rng.normal(size=(COUNT, 2)))[0]

@@ -102,6 +102,22 @@ def test_values_are_as_unsure_as_parts_of_the_data_disagree():
     assert found[2] == deviation[2] > jackknife[2]
 
 
+def test_a_value_that_one_part_alone_shows_is_as_sure_as_there():
+    """Without that part nothing is known of it: the others' fit of it is no second opinion."""
+    rng = np.random.default_rng(7)
+    X, part = rng.normal(size=(1, 80, 2)), np.repeat(np.arange(4), 20)
+    X[..., 1] *= part == 2
+    y = X @ [1.0, 2.0] + 0.1 * rng.normal(size=(1, 80))
+    theta = np.linalg.lstsq(X[0], y[0], rcond=None)[0]
+    rows = Rows(y, X, X, np.zeros((0, 80), int), np.ones((1, 80)), part, part)
+    state = SimpleNamespace(theta=theta, prior=Prior(np.zeros(2), np.full(2, 1e-9)))
+    step: Any = SimpleNamespace(rows=rows, state=state)
+    covariance = 0.01 * np.linalg.inv(X[0].T @ X[0])
+    problem: Any = SimpleNamespace(layout=SimpleNamespace(part=part))
+    told = with_parts(problem, Joint(step, [], Fitted(theta, covariance, ())), np.ones((1, 2))).fitted.covariance
+    assert 1.0 <= told[1, 1] / covariance[1, 1] < 4.0
+
+
 def test_values_are_as_unsure_as_what_is_left_at_their_joint(monkeypatch: pytest.MonkeyPatch):
     """A misfit of ten functions of equal size, of which one is the cause's: it moves by what one of them has."""
     rng = np.random.default_rng(8)

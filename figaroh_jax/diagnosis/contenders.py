@@ -19,7 +19,7 @@ from .believed import believed
 from .comparison import Ground, Hypothesis, Verdicts, grown_sums, judge, judge_grown, last_coefficient, sums_of
 from .design import BATCH, kind, shapes, unit_rows, units, with_shape
 from .estimates import torque_slope
-from .joint import polished
+from .joint import POLISH, polished
 from .problem import Problem
 from .refit import Whitened, refit, refit_shift
 from .screening import Group, Screen
@@ -317,9 +317,15 @@ def _limit_contender(
 ) -> Contender:
     """A drive at its limit, all coefficients fitted with it: where it holds, the torque says nothing of them."""
     effect = with_shape(jax.tree.map(lambda x: x[order[0]], group.effect), group.effect.amplitudes(), [np.float64(1.0)])
-    joint = polished(problem, step.state, [effect], whitening)
     joints = acting(effect, len(step.rows.y), group.columns.joints)
-    return Contender(group.name, joint.causes[0], joint.step.verdicts, joints, step.loose and joint.step.free)
+    for turns in (0, POLISH):
+        here = polished(problem, step.state, [effect], whitening, turns)
+        (effect,), free = here.causes, step.loose and here.step.free
+        one = Contender(group.name, effect, here.step.verdicts, joints, free)
+        bounds = effect.parameters()["share"]
+        if not (worth_trying(step, one) and bounds.lower < float(effect.share) < bounds.upper):
+            break
+    return one
 
 
 def _expanded_contender(problem: Problem, step: Step, base: Ground, ready: Whitened, group: Group) -> Contender:

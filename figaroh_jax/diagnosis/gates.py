@@ -24,6 +24,10 @@ def exists(problem: Problem, effect: Effect) -> bool:
     """
     if not effect.shown_by(*problem.reached):
         return False
+    if effect.acts_on == "joint":
+        joint = int(effect.at[0])
+        if not effect.allows(problem.torque[..., joint][np.asarray(problem.records.judged)[..., joint] > 0]):
+            return False
     values = {name: float(getattr(effect, name)) for name in effect.parameters()}
     if effect.body and values["mass"] > float(np.asarray(problem.model.inertia)[:, 0].sum()):
         return False

@@ -55,7 +55,9 @@ class Joint(NamedTuple):
     fitted: Fitted
 
 
-def polished(problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> Joint:
+def polished(
+    problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"], turns: int = POLISH
+) -> Joint:
     """All causes fitted together: Gauss-Newton steps over coefficients and shapes until they settle.
 
     Sensor effects follow the load and the torque, so each turn begins with what the last one made of the baseline.
@@ -65,7 +67,7 @@ def polished(problem: Problem, start: State, causes: list[Effect], whitening: Fl
     """
     joint = least = _together(problem, start, causes, whitening)
     share, before = np.ones_like(joint.fitted.value), np.zeros_like(joint.fitted.value)
-    for turn in range(0 if all(map(_settled, causes)) else POLISH):
+    for turn in range(0 if all(map(_settled, causes)) else turns):
         move = _move(joint)
         if turn >= LATE:
             share = np.where(move * before < -BACK * before**2, share / 2, share)

@@ -385,6 +385,10 @@ class Effect(eqx.Module):
         """Whether motion between the positions `low` and `high` can tell the effect from a smooth torque at all."""
         return True
 
+    def allows(self, torque: Float[np.ndarray, " rows"]) -> bool:
+        """Whether the joint where it acts can have had the torques (N m or N) that were measured there."""
+        return True
+
     def native(self) -> tuple[Native, ...]:
         """Elements of MJCF that carry the effect (URDF takes `damping` and `frictionloss` of a joint)."""
         return ()

@@ -27,6 +27,7 @@ __all__ = [
 ]
 
 NEAR = 1e-3  # samples between two times that count as one
+OVERSHOOT, PASSED = 0.1, 0.01  # of a limit, by which noise may pass it; share of the rows beyond that
 
 
 @register
@@ -122,6 +123,10 @@ class TorqueSaturation(JointEffect):
         """1 below the limit, 1 - share beyond it: there the torque says nothing of what the drive was to give."""
         return np.where(np.abs(np.asarray(self.here(motion.total))) > self.limit, 1 - self.share, 1.0)
 
+    def allows(self, torque: Float[np.ndarray, " rows"]) -> bool:
+        """No more than `PASSED` of the torques are beyond the limit by more than `OVERSHOOT` of it, as noise may be."""
+        return float(np.mean(np.abs(torque) > (1 + OVERSHOOT) * self.limit)) <= PASSED
+
     def physical(self) -> dict[str, Scalar]:
         """The limit alone: the share is 1 where a drive is saturated."""
         return {"limit": self.limit}
@@ -133,9 +138,16 @@ class TorqueSaturation(JointEffect):
 
     @classmethod
     def starts(cls, motion: Motion, place: int) -> dict[str, tuple[float, ...]]:
-        """Limits at which the search begins: high quantiles of the torque as measured, N m or N."""
-        size = np.abs(np.asarray(motion.total)[:, place])
-        return {"limit": tuple(np.unique(np.quantile(size, (0.7, 0.8, 0.88, 0.94, 0.97, 0.99))).tolist())}
+        """The limit at which the search begins, N m or N: what most of the largest torques measured are near to.
+
+        The middle of the shortest stretch that holds a quarter of those that may be at a limit (a mode: Robertson and
+        Cryer, 1974).
+        """
+        size = np.sort(np.abs(np.asarray(motion.total)[:, place]))
+        size = size[np.searchsorted(size, np.quantile(size, 1 - PASSED) / (1 + OVERSHOOT)) :]
+        count = len(size) // 4
+        first = int(np.argmin(size[count:] - size[: len(size) - count]))
+        return {"limit": (float(size[first : first + count + 1].mean()),)}
 
 
 @register
