@@ -25,6 +25,7 @@ from .served import Server
 
 REAL = ("ur10e", "kuka", "panda", "tx40", "tiago", "dfki_simple_pendulum", "dfki_double_pendulum")
 LIMIT = 400.0  # s of a call
+MAKERS = 3  # processes that make the cases of a study, at the least
 COMMAND = f"{blackbox.HERE} figaroh_jax.cli:main diagnose {{task}} --out {{out}} --quiet"  # in processes that stay
 
 
@@ -54,21 +55,20 @@ def studies(seed: int) -> list[Study]:
         for r in REAL
     ]
     made = {
-        "closed_loop": ("closed_loop", 40, (), _due_closed_loop, 3),
-        "inverse_hidden": ("inverse", 0, ("0.05-", "0.15-", "0.02-"), _due_inverse, 3),
-        **{f"inverse_clean_{k}": ("inverse", 50, ("/clean",), _due_inverse, 2) for k in range(4)},
-        "kinematic": ("kinematic", 60, (), _due_kinematic, 2),
+        "closed_loop": ("closed_loop", 40, (), _due_closed_loop),
+        "inverse_hidden": ("inverse", 0, ("0.05-", "0.15-", "0.02-"), _due_inverse),
+        **{f"inverse_clean_{k}": ("inverse", 50, ("/clean",), _due_inverse) for k in range(4)},
+        "kinematic": ("kinematic", 60, (), _due_kinematic),
     }
     others = [
         Study(
             name,
             "hide_and_name",
-            ("--seed", str(seed + 1 + k), "--kinds", kind, "--clean", str(clean), "--jobs", str(jobs))
-            + (("--only", *only) if only else ()),
+            ("--seed", str(seed + 1 + k), "--kinds", kind, "--clean", str(clean)) + (("--only", *only) if only else ()),
             due,
             {"closed_loop": -1.0, "inverse": 3.7, "kinematic": 5.9}[kind],
         )
-        for k, (name, (kind, clean, only, due, jobs)) in enumerate(made.items())
+        for k, (name, (kind, clean, only, due)) in enumerate(made.items())
     ]
     return [*real, *others]
 
@@ -128,7 +128,7 @@ class Pool:
     """Generators, calls and what is due next."""
 
     def __init__(self, args: argparse.Namespace, kept: list[Study], sets: list[str]) -> None:
-        self.args, self.end = args, time.monotonic() + args.seconds
+        self.args, self.end, self.studies = args, time.monotonic() + args.seconds, max(len(kept), 1)
         self.due: list[Due] = []
         self.count, self.busy, self.changed = 0, 0, threading.Condition()
         for study in kept:
@@ -191,6 +191,8 @@ class Pool:
         folder.mkdir(parents=True, exist_ok=True)
         kept.mkdir(parents=True, exist_ok=True)
         words = [sys.executable, "-m", f"benchmarks.{study.module}", "generate", "--cases", str(folder), *study.made]
+        if study.module == "hide_and_name":
+            words += ["--jobs", str(max(MAKERS, self.args.jobs // self.studies))]
         ran = subprocess.run(words, capture_output=True, text=True)
         if ran.returncode:
             return f"{study.name}: no cases\n{ran.stderr[-1500:]}"
