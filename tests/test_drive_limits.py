@@ -14,6 +14,7 @@ from generators.inverse import make_case
 from synthetic import made_signals
 
 import figaroh_jax as fj
+from figaroh_jax.diagnosis.design import with_shape
 from figaroh_jax.diagnosis.layout import held_rows, layout
 from figaroh_jax.diagnosis.problem import Problem
 from figaroh_jax.diagnosis.state import baseline, extended_state, solved, whitened
@@ -80,6 +81,6 @@ def test_a_limit_is_found_and_sized(size: float, at: str, trajectories: int):
 
 def test_a_limit_that_the_torque_passes_is_none():
     model_torque = np.linspace(-10.0, 10.0, 2001)
-    drive = find("torque_saturation")(np.array([0]), share=np.float64(1.0), limit=np.float64(8.0))
+    drive = with_shape(find("torque_saturation")(np.array([0])), ["share", "limit"], [np.float64(1.0), np.float64(8.0)])
     noisy = np.clip(model_torque, -8.0, 8.0) + 0.2 * np.random.default_rng(2).normal(size=len(model_torque))
     assert drive.allows(noisy) and not drive.allows(model_torque)

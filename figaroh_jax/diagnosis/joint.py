@@ -361,9 +361,12 @@ def least_sure(joint: Joint) -> int | None:
 
 
 def _amplitudes(effect: Effect) -> list[int]:
-    """Which of an effect's amplitudes no simpler effect has."""
+    """Which of an effect's amplitudes no simpler effect has; of one that is known before any data, its shapes."""
     simpler = {name for inside in type(effect).contains for name in find(inside).parameters()}
-    return [k for k, name in enumerate(effect.amplitudes()) if name not in simpler]
+    own, known = effect.amplitudes(), effect.parameters()
+    if any(known[name].expected is not None for name in own):
+        return list(range(len(own), len(own) + len(shapes(type(effect)))))
+    return [k for k, name in enumerate(own) if name not in simpler]
 
 
 def _shape_places(effect: Effect, place: tuple[int, ...]) -> Sequence[int]:

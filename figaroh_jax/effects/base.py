@@ -179,7 +179,8 @@ def amplitude(
 ) -> Any:
     """Declare a parameter in which the torque is linear; outside of its bounds the effect is not one that exists.
 
-    `expected` are its value before any data and the deviation of that; without them any size is as likely.
+    `expected` are its value before any data and the deviation of that (1 and 0.02: all of what is beyond a limit is
+    cut off); without them any size is as likely.
 
     >>> import figaroh_jax as fj
     >>> class Drag(fj.Effect):

@@ -105,8 +105,7 @@ class TorqueSaturation(JointEffect):
     follows_torque = follows_total = True
     equation = "clip(tau_hat, -limit, limit) - tau_hat"
     separated_by = "motion of {at} at two larger accelerations: the largest torque stays"
-    # of what lies above the limit; 1 where nothing passes, which is expected where few samples lie there
-    share: Scalar = amplitude("", lower=0.5, upper=2.0, expected=(1.0, 1.0))
+    share: Scalar = amplitude("", lower=0.5, upper=2.0, expected=(1.0, 0.02))  # of what is cut: none passes a limit
     limit: Scalar = shape("N m", (1.0, 3.0, 10.0, 30.0, 100.0, 300.0), (0.0, 1e5))
 
     def torque_error(self, motion: Motion) -> Float[Array, " samples"]:
