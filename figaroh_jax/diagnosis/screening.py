@@ -23,7 +23,7 @@ from .bank import Bank, Columns, bank
 from .design import Units, flattened, kind, local, unit_rows, units
 from .evidence import Score, block_scores, largest, other_scores, projection, pulled, scores
 from .problem import Problem, without_factor
-from .state import State
+from .state import State, batched, unit_torques
 
 __all__ = [
     "CHUNK",
@@ -33,6 +33,7 @@ __all__ = [
     "Shown",
     "catalogue",
     "draw_noise",
+    "exact_columns",
     "family_p",
     "noise_squares",
     "place_p",
@@ -187,6 +188,18 @@ def _fresh_families(
     late = [n for n in sensors if kind(sensors[n]) == "response"]  # one program
     for names in [late, *([n] for n in sensors if n not in late)]:
         yield units({n: flattened(sensors[n]) for n in names}, state.motion, problem.records)
+
+
+def exact_columns(
+    problem: Problem, state: State, rows: Rows, whitening: Float[np.ndarray, "F nv"], effect: Effect
+) -> Columns:
+    """Whitened columns of one effect alone, its shape as it is, as `catalogue` has them."""
+    if effect.inertial:
+        return _link_columns(rows, int(np.asarray(effect.at)[0]), problem.model)
+    given = unit_torques(problem, state, batched(effect))
+    response = whitening * state.response(problem.records.omega)[:, None]
+    Z = unit_rows(given, problem.records, response)
+    return Columns(tuple(given.joints[0].tolist()), Z.reshape(*Z.shape[:3], -1))
 
 
 def _turned(batch: Effect, joints: Collection[int]) -> Bool[np.ndarray, " places"]:
