@@ -94,6 +94,20 @@ class Part:
         return cls(lambda: made, (columns.shape[2], *columns.shape[:2]))
 
     @classmethod
+    def of_series(
+        cls,
+        series: Float[np.ndarray, "series nN"],
+        joint: Int[np.ndarray, " series"],
+        column: Int[np.ndarray, " series"],
+        nv: int,
+    ) -> Part:
+        """The part of columns each at one joint, in any order."""
+        order = np.lexsort((column, joint))
+        order = order[series.any(1)[order]]
+        made = _Columns(series[order], joint[order], column[order])
+        return cls(lambda: made, (series.shape[1], nv, int(column.max(initial=-1)) + 1))
+
+    @classmethod
     def of_samples(cls, columns: Float[np.ndarray, "nN nv k"]) -> Part:
         """The part of columns that lie sample by sample."""
         joint, column = np.nonzero(columns.any(0))

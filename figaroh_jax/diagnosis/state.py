@@ -350,10 +350,10 @@ def _term_columns(problem: Problem, state: State, term: Effect) -> Part:
 
 def _columns(problem: Problem, state: State, term: Effect) -> Part:
     given = unit_torques(problem, state, term)
-    columns = np.zeros((problem.model.nv, *given.torque.shape[:2], given.torque.shape[3]))
-    for one, joints in enumerate(given.joints):
-        np.add.at(columns[:, one], joints, given.torque[one].swapaxes(0, 1))
-    return Part.of(columns.reshape(problem.model.nv, -1, columns.shape[-1]))
+    places, count, rows, samples = given.torque.shape
+    joint = np.broadcast_to(given.joints[:, None], (places, count, rows)).reshape(-1)
+    column = np.repeat(np.arange(places * count), rows)
+    return Part.of_series(given.torque.reshape(-1, samples), joint, column, problem.model.nv)
 
 
 def _rigid(problem: Problem, motion: Motion) -> Part:
