@@ -97,10 +97,10 @@ class State:
         self, load: Float[np.ndarray, "rows nv"], theta: Float[np.ndarray, " P"], rows: slice = slice(None)
     ) -> Float[np.ndarray, "rows nv"]:
         """The load with the torque of each term."""
-        total = load.copy()
+        terms = np.zeros(load.shape[::-1]).T  # a joint's samples follow one another
         for part, own in zip(self.parts[1:], self._of_terms(theta), strict=True):
-            part.add(own, total, rows)
-        return total
+            part.add(own, terms, rows)
+        return np.add(load, terms, order="C")
 
     def _of_terms(self, theta: Float[np.ndarray, " P"]) -> list[Float[np.ndarray, " k"]]:
         """The coefficients of each term."""
