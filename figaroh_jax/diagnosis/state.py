@@ -238,7 +238,8 @@ def with_width(problem: Problem, state: State) -> State:
         return state
     moved = replace(state, measured=problem.motion)
     pairs = list(zip(state.terms, state.parts[1:], strict=True))
-    parts = [part if term.follows_total else _term_columns(problem, moved, term) for term, part in pairs]
+    same = [term.follows_total or not term.reverses for term in state.terms]
+    parts = [p if own else _term_columns(problem, moved, term) for (term, p), own in zip(pairs, same, strict=True)]
     moved = replace(moved, parts=(state.rigid, *parts))
     if not any(term.follows_total for term in state.terms):
         return moved
