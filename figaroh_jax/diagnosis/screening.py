@@ -102,7 +102,7 @@ def catalogue(
 
     `before` are the groups of an earlier state of the same problem with the same response: columns that do not follow
     the torque are kept. Where the friction of the joints `turned` reverses over another width since then, what follows
-    that there, or at all joints, is evaluated anew, and all sensors.
+    that there, or at all joints, is evaluated anew.
     """
     taken = {(type(e).name, at) for term in state.terms for e, at in _places_of(term)}
     taken |= {(effect.name, tuple(int(i) for i in np.asarray(effect.at))) for effect in state.sensors}
@@ -165,8 +165,7 @@ def _fresh_columns(
             placed(name, rows * (weight * factor[:, None, None])[at][:, None], at)
     masks = {n: np.repeat(np.isin(np.arange(len(b.at)), asked[n]), b.at.shape[1]) for n, b in measured.items()}
     masks = {} if plain else {name: mask for name, mask in masks.items() if mask.any()}
-    everything = turned is None or len(turned) > 0
-    for family in _fresh_families(problem, state, wanted, everything, masks):  # samples of one family at a time
+    for family in _fresh_families(problem, state, wanted, turned is None, masks):  # samples of one family at a time
         for name, given in family.items():
             placed(name, unit_rows(given, problem.records, response), given.joints)
     return out
