@@ -122,7 +122,7 @@ def catalogue(
             columns = fresh.get(name, {}).get(place, known.columns if known else None)
             if columns is None and batches[name].inertial:
                 columns = _link_columns(rows, at[0], problem.model)
-            if columns is not None and np.abs(columns.Z).max() > 0:
+            if columns is not None and columns.Z.any():
                 one = known.effect if known else jax.tree.map(lambda x, p=place: np.asarray(x)[p], batches[name])
                 groups.append(Group(title, one, columns))
     return groups
