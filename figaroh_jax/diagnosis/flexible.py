@@ -250,12 +250,13 @@ def _posture(motion: Motion) -> list[Float[np.ndarray, " nN"]]:
 
 def smooth_functions(motion: Motion) -> list[Float[np.ndarray, "k nN"]]:
     """For each joint: smooth functions of its position, speed and load, and of its friction over position and speed."""
-    every = slice(np.shape(motion.velocity)[1])
-    powers, s = _powers(motion, every), _direction(motion, every)
-    speed, load = to_unit(np.abs(np.asarray(motion.velocity))), to_unit(np.asarray(motion.load))
-    more = [speed, 2 * speed**2 - 1, load, 2 * load**2 - 1, s * load, s * (2 * load**2 - 1), np.ones_like(s)]
-    each = np.concatenate([powers, _friction(motion, every, powers), more])
-    return [np.ascontiguousarray(each[:, :, joint]) for joint in range(s.shape[1])]
+    out = []
+    for joint in range(np.shape(motion.velocity)[1]):
+        powers, s, load = _powers(motion, joint), _direction(motion, joint), to_unit(np.asarray(motion.load)[:, joint])
+        speed = to_unit(np.abs(np.asarray(motion.velocity)[:, joint]))
+        more = [speed, 2 * speed**2 - 1, load, 2 * load**2 - 1, s * load, s * (2 * load**2 - 1), np.ones_like(s)]
+        out.append(np.concatenate([powers, _friction(motion, joint, powers), more]))
+    return out
 
 
 def rough_functions(motion: Motion, joint: int) -> list[Float[np.ndarray, "k nN"]]:

@@ -99,13 +99,13 @@ class Part:
         series: Float[np.ndarray, "series nN"],
         joint: Int[np.ndarray, " series"],
         column: Int[np.ndarray, " series"],
-        nv: int,
+        shape: tuple[int, int],
     ) -> Part:
-        """The part of columns each at one joint, in any order."""
+        """The part of columns each at one joint, in any order; `shape` are coordinates and columns."""
         order = np.lexsort((column, joint))
         order = order[series.any(1)[order]]
         made = _Columns(series[order], joint[order], column[order])
-        return cls(lambda: made, (series.shape[1], nv, int(column.max(initial=-1)) + 1))
+        return cls(lambda: made, (series.shape[1], *shape))
 
     @classmethod
     def of_samples(cls, columns: Float[np.ndarray, "nN nv k"]) -> Part:
@@ -449,7 +449,7 @@ class Problem:
         The torque of all grid points at all samples would be the largest thing in memory by far. `wanted` are the ones
         asked for, on one axis of places and grid points.
         """
-        if len(self.motion.time) <= SHORT:
+        if wanted and len(self.motion.time) <= SHORT:
             every = self._family("shaped")
             yield {name: every[name].of(own) for name, own in wanted.items()}
             return

@@ -354,7 +354,8 @@ def _columns(problem: Problem, state: State, term: Effect) -> Part:
     places, count, rows, samples = given.torque.shape
     joint = np.broadcast_to(given.joints[:, None], (places, count, rows)).reshape(-1)
     column = np.repeat(np.arange(places * count), rows)
-    return Part.of_series(given.torque.reshape(-1, samples), joint, column, problem.model.nv)
+    shape = problem.model.nv, places * count
+    return Part.of_series(given.torque.reshape(-1, samples), joint, column, shape)
 
 
 def _rigid(problem: Problem, motion: Motion) -> Part:
