@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -284,7 +284,8 @@ def dependences(motion: Motion, joint: int) -> dict[Dependence, Float[np.ndarray
 
 def _direction(motion: Motion, at: int | slice) -> Float[np.ndarray, "nN *joints"]:
     """`Motion.direction` of some joints."""
-    v, a, width = (np.asarray(x)[..., at] for x in (motion.velocity, motion.acceleration, motion.width))
+    given: list[Any] = [np.asarray(x)[..., at] for x in (motion.velocity, motion.acceleration, motion.width)]
+    v, a, width = given
     return np.asarray(smooth_sign(v, a, motion.dt, width))
 
 

@@ -103,7 +103,7 @@ class Part:
     ) -> Part:
         """The part of columns each at one joint, in any order; `shape` are coordinates and columns."""
         order = np.lexsort((column, joint))
-        order = order[series.any(1)[order]]
+        order = order[np.asarray(series.any(1))[order]]
         made = _Columns(series[order], joint[order], column[order])
         return cls(lambda: made, (series.shape[1], *shape))
 
