@@ -220,6 +220,13 @@ def test_columns_are_the_torque_of_a_unit_of_each_amplitude(name: str, model: Ro
     np.testing.assert_allclose(np.tensordot(amplitudes, found, 1), added(effect, motion), rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", [name for name, effect in CATALOGUE.items() if not effect.reverses])
+def test_what_reverses_with_no_friction_has_the_same_torque_over_any_width(name: str, model: RobotModel):
+    motion, effect = moving(model), made(name, model)
+    wider = eqx.tree_at(lambda m: m.width, motion, motion.width + 0.3)
+    np.testing.assert_array_equal(added(effect, motion), added(effect, wider))
+
+
 @pytest.mark.parametrize("name", TORQUES)
 def test_gradient_equals_finite_differences_in_every_parameter(name: str, model: RobotModel):
     motion, effect = moving(model), made(name, model)

@@ -46,6 +46,7 @@ class Bank(NamedTuple):
     own: list[Float[np.ndarray, "grid k k"]]  # Zi'Zi of each candidate
     ZX: Float[np.ndarray, "columns P"]  # Zi'X
     ZXi: Float[np.ndarray, "columns P"]  # Zi'Xi
+    Zy: Float[np.ndarray, " columns"]  # Zi'y
 
     @property
     def width(self) -> int:
@@ -83,7 +84,8 @@ def bank(rows: Rows, candidates: list[Columns], before: Bank | None = None) -> B
             kept[first : first + size] = before.span[i][0] + np.arange(size)
     ZX = _grown_product(rows.X, blocks, kept, before.ZX if before else None)
     ZXi = _grown_product(rows.Xi, blocks, kept, before.ZXi if before else None) if len(rows.partner) else ZX
-    return Bank(candidates, span, parts, blocks, own, ZX, ZXi)
+    Zy = _grown_product(rows.y[..., None], blocks, kept, before.Zy[:, None] if before else None)[:, 0]
+    return Bank(candidates, span, parts, blocks, own, ZX, ZXi, Zy)
 
 
 def _beside_more(rows: Rows, before: Bank) -> Bank:
@@ -150,6 +152,8 @@ def _product(width: int, blocks: list[Block], rows: list[Float[np.ndarray, "T m"
     for joint in sorted({block.joint for block in blocks}):
         beside = [block for block in blocks if block.joint == joint and len(block.columns)]
         own = rows[joint]
+        if not own.any():  # columns of a cause at other joints
+            continue
         if len(beside) < 2 or own.shape[1] < MANY:
             for block in beside:
                 out[block.columns] += block.Zi @ own

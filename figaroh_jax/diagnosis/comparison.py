@@ -288,7 +288,7 @@ def t_needed(blocks: int, t: float, tried: int = 1) -> float:
 def overlap(current: Verdicts, one: Verdicts, other: Verdicts) -> float:
     """Cosine between what two hypotheses change of the current residual: 1, the same misfit; 0, another one."""
     a, b = (current.residual - v.residual for v in (one, other))
-    return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum() + 1e-300))
+    return float(np.vdot(a, b) / np.sqrt(np.vdot(a, a) * np.vdot(b, b) + 1e-300))
 
 
 def shares_of_wins(

@@ -45,7 +45,7 @@ def projection(linear: Linear, stock: Bank) -> Float[np.ndarray, "P columns"]:
 
 def scores(linear: Linear, stock: Bank, H: Float[np.ndarray, "P columns"]) -> list[Score]:
     """Score s = Zi'r of every candidate and Q = s'V^-1 s, V its variance with the current model projected out."""
-    s = stock.product([r[:, None] for r in linear.residual])[:, 0]
+    s = stock.Zy - stock.ZX @ linear.theta
     moved, out = (linear.moment @ H).T, list[Score | None]([None] * len(stock.span))
     for members, columns in _by_width(stock.span):
         h, xz, mh = H.T[columns], stock.ZXi[columns], moved[columns]

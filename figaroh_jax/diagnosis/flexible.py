@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..effects.base import Motion, changed
+from ..effects.base import Motion, changed, smooth_sign
 from ..estimation.noise import Spectrum
-from ..recordings.stacked import filtered_rows
+from ..recordings.stacked import filter_rows, filtered_rows
 from ..results import Dependence, Name
 from .bank import Columns
 from .design import units
-from .problem import Problem
+from .problem import Problem, without_factor
 from .screening import Group, Null, family_p, screen
 from .state import FRICTION_PRECISION, State, whitened
 from .step import Step
@@ -118,14 +118,10 @@ def _smooth_rows(
     problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"]
 ) -> Float[np.ndarray, "nv T functions"]:
     """Position, time, offset and acceleration of each joint, each in its own rows."""
-    joints = [_smooth(state.motion, joint) for joint in range(problem.model.nv)]
-    acceleration = np.asarray(state.motion.acceleration)
-    series = [np.stack([j["position"][k] for j in joints], 1) for k in range(DEGREES)]
-    series += [np.stack([j["time"][k] for j in joints], 1) for k in range(DEGREES - 1)]
-    each = [
-        filtered_rows(problem.records, one, whitening) for one in (*series, acceleration, np.ones_like(acceleration))
-    ]
-    return np.stack(each, axis=2)
+    motion, every = state.motion, slice(problem.model.nv)
+    acceleration = np.asarray(motion.acceleration)[None]
+    series = (_powers(motion, every), _cosines(motion)[..., None], acceleration, np.ones_like(acceleration[..., :1]))
+    return np.moveaxis(np.concatenate([_rows(problem, one, whitening) for one in series]), 0, 2)
 
 
 def _coulomb_column(problem: Problem, state: State, joint: int) -> int | None:
@@ -195,56 +191,71 @@ def rich_families(
 
 
 def _groups(
-    problem: Problem, series: dict[str, list[Float[np.ndarray, "nN nv"]]], whitening: Float[np.ndarray, "F nv"]
+    problem: Problem, series: dict[str, Float[np.ndarray, "k nN _"]], whitening: Float[np.ndarray, "F nv"]
 ) -> list[Group]:
     groups = []
     for title, columns in series.items():
-        rows = np.stack([filtered_rows(problem.records, one, whitening) for one in columns])
+        rows = _rows(problem, columns, whitening)
         for joint, name in enumerate(problem.model.joint_names):
             groups.append(Group(Name(title, (name,)), None, Columns((joint,), rows[None, :, joint][:, :, None])))
     return groups
 
 
-def _smooth_series(motion: Motion) -> dict[str, list[Float[np.ndarray, "nN nv"]]]:
-    nv = np.asarray(motion.velocity).shape[1]
-    joints = [_smooth(motion, joint) for joint in range(nv)]
-    series = {
-        title: [np.stack([j[title][k] for j in joints], 1) for k in range(len(joints[0][title]))] for title in joints[0]
+def _rows(
+    problem: Problem, columns: Float[np.ndarray, "k nN _"], whitening: Float[np.ndarray, "F nv"]
+) -> Float[np.ndarray, "k nv T"]:
+    """Whitened rows of columns, each joint's own or (on an axis of one) the same at all joints."""
+    n, samples, _, nv = problem.records.shape
+    torque = np.moveaxis(columns, 2, 1).reshape(len(columns), -1, n, samples)
+    response, factor = without_factor(whitening)
+    if (response == 1).all():
+        rows = filter_rows(problem.records, torque, fitted=True)
+    else:
+        every = np.broadcast_to(torque, (len(columns), nv, n, samples))
+        rows = filter_rows(problem.records, every, response.T, fitted=True)
+    weight = np.moveaxis(np.asarray(problem.records.weight), 2, 0) * factor[:, None, None]
+    return (rows * weight).reshape(len(columns), nv, -1)
+
+
+def _smooth_series(motion: Motion) -> dict[str, Float[np.ndarray, "k nN _"]]:
+    every = slice(np.shape(motion.velocity)[1])
+    powers = _powers(motion, every)
+    return {
+        "position": powers,
+        "friction": _friction(motion, every, powers),
+        "time": _cosines(motion)[..., None],
+        "constant": np.ones((1, len(np.asarray(motion.time)), 1)),
+        "posture": np.stack(_posture(motion))[..., None],
     }
-    series["constant"] = [np.ones_like(np.asarray(motion.position))]
-    series["posture"] = [np.repeat(column[:, None], nv, axis=1) for column in _posture(motion)]
-    return series
 
 
-def _few_series(motion: Motion) -> dict[str, list[Float[np.ndarray, "nN nv"]]]:
+def _few_series(motion: Motion) -> dict[str, Float[np.ndarray, "k nN nv"]]:
     v, s, a = np.asarray(motion.velocity), np.asarray(motion.direction), np.asarray(motion.acceleration)
-    w = to_unit(np.asarray(motion.time))[:, None]
-    speed = np.stack([to_unit(np.abs(own)) for own in v.T], axis=1)
-    load = np.stack([to_unit(own) for own in np.asarray(motion.load).T], axis=1)
+    w, speed, load = to_unit(np.asarray(motion.time))[:, None], to_unit(np.abs(v)), to_unit(np.asarray(motion.load))
     series = {
-        "speed": [np.abs(s), speed, 2 * speed**2 - 1],
-        "drift": [w * s, w**2 * s, w * v],
-        "load": [s * load, s * np.abs(load)],
-        "acceleration": [a],
+        "speed": np.stack([np.abs(s), speed, 2 * speed**2 - 1]),
+        "drift": np.stack([w * s, w**2 * s, w * v]),
+        "load": np.stack([s * load, s * np.abs(load)]),
+        "acceleration": a[None],
     }
-    return series | {f"neighbour {k}": [np.roll(x, k, axis=1) for x in (s, v, a)] for k in range(1, s.shape[1])}
+    around = np.stack([s, v, a])
+    return series | {f"neighbour {k}": np.roll(around, k, axis=2) for k in range(1, s.shape[1])}
 
 
 def _posture(motion: Motion) -> list[Float[np.ndarray, " nN"]]:
     """First and second degree in all positions: near to any torque that follows the posture alone."""
-    x = [to_unit(q) for q in np.asarray(motion.position).T]
+    x = to_unit(np.asarray(motion.position)).T
     return [*x, *(x[i] * x[k] for i in range(len(x)) for k in range(i + 1))]
 
 
 def smooth_functions(motion: Motion) -> list[Float[np.ndarray, "k nN"]]:
     """For each joint: smooth functions of its position, speed and load, and of its friction over position and speed."""
-    out, loads = [], np.asarray(motion.load)
-    for joint in range(loads.shape[1]):
-        own = _smooth(motion, joint)
-        speed, load = to_unit(np.abs(np.asarray(motion.velocity)[:, joint])), to_unit(loads[:, joint])
-        s = np.asarray(motion.direction)[:, joint]
+    out = []
+    for joint in range(np.shape(motion.velocity)[1]):
+        powers, s, load = _powers(motion, joint), _direction(motion, joint), to_unit(np.asarray(motion.load)[:, joint])
+        speed = to_unit(np.abs(np.asarray(motion.velocity)[:, joint]))
         more = [speed, 2 * speed**2 - 1, load, 2 * load**2 - 1, s * load, s * (2 * load**2 - 1), np.ones_like(s)]
-        out.append(np.stack([*own["position"], *own["friction"], *more]))
+        out.append(np.concatenate([powers, _friction(motion, joint, powers), more]))
     return out
 
 
@@ -259,32 +270,49 @@ def rough_functions(motion: Motion, joint: int) -> list[Float[np.ndarray, "k nN"
     return [*(waves[k : k + 2].reshape(4, -1) for k in range(FINEST - 1)), *([beside] if len(beside) else [])]
 
 
-def dependences(motion: Motion, joint: int) -> dict[Dependence, list[Float[np.ndarray, " nN"]]]:
+def dependences(motion: Motion, joint: int) -> dict[Dependence, Float[np.ndarray, "k nN"]]:
     """Smooth functions of what a rest of the joint may go with: position, velocity, load, time."""
-    own, load = _smooth(motion, joint), to_unit(np.asarray(motion.load)[:, joint])
-    s, speed = np.asarray(motion.direction)[:, joint], to_unit(np.abs(np.asarray(motion.velocity)[:, joint]))
-    return {
-        "position": own["position"],
-        "velocity": [*own["friction"][:4], speed, 2 * speed**2 - 1],
-        "load": [load, 2 * load**2 - 1, s * load, s * (2 * load**2 - 1)],
-        "time": own["time"],
-    }
-
-
-def _smooth(motion: Motion, joint: int) -> dict[str, list[Float[np.ndarray, " nN"]]]:
-    q, v = np.asarray(motion.position)[:, joint], np.asarray(motion.velocity)[:, joint]
-    t, s = np.asarray(motion.time), np.asarray(motion.direction)[:, joint]
-    x, u, w = to_unit(q), to_unit(np.abs(v)), to_unit(t)
-    powers = [np.polynomial.chebyshev.chebval(x, np.eye(DEGREES + 1)[k]) for k in range(1, DEGREES + 1)]
-    speeds = [np.polynomial.chebyshev.chebval(u, np.eye(4)[k]) for k in range(4)]
+    powers, load = _powers(motion, joint), to_unit(np.asarray(motion.load)[:, joint])
+    s, speed = _direction(motion, joint), to_unit(np.abs(np.asarray(motion.velocity)[:, joint]))
     return {
         "position": powers,
-        "friction": [s * f for f in speeds] + [s * p for p in powers[:3]] + [np.abs(s) * p for p in powers[:1]],
-        "time": [np.cos(np.pi * k * (w + 1) / 2) for k in range(1, DEGREES)],
+        "velocity": np.stack([*_friction(motion, joint, powers)[:4], speed, 2 * speed**2 - 1]),
+        "load": np.stack([load, 2 * load**2 - 1, s * load, s * (2 * load**2 - 1)]),
+        "time": _cosines(motion),
     }
 
 
-def to_unit(x: Float[np.ndarray, " nN"]) -> Float[np.ndarray, " nN"]:
-    """The values brought to between -1 and 1."""
-    low, high = x.min(), x.max()
-    return 2 * (x - low) / max(high - low, 1e-9) - 1
+def _direction(motion: Motion, at: int | slice) -> Float[np.ndarray, "nN *joints"]:
+    """`Motion.direction` of some joints."""
+    given: list[Any] = [np.asarray(x)[..., at] for x in (motion.velocity, motion.acceleration, motion.width)]
+    v, a, width = given
+    return np.asarray(smooth_sign(v, a, motion.dt, width))
+
+
+def _powers(motion: Motion, at: int | slice) -> Float[np.ndarray, "k nN *joints"]:
+    """Polynomials in the position of some joints, of each degree from the first."""
+    return _chebyshev(to_unit(np.asarray(motion.position)[:, at]), DEGREES)[1:]
+
+
+def _friction(
+    motion: Motion, at: int | slice, powers: Float[np.ndarray, "p nN *joints"]
+) -> Float[np.ndarray, "k nN *joints"]:
+    """Dry friction of some joints over their speed and position, of which `powers` are the polynomials."""
+    s, speeds = _direction(motion, at), _chebyshev(to_unit(np.abs(np.asarray(motion.velocity)[:, at])), 3)
+    return np.concatenate([s * speeds, s * powers[:3], np.abs(s) * powers[:1]])
+
+
+def _cosines(motion: Motion) -> Float[np.ndarray, "k nN"]:
+    """Cosines over the time."""
+    return np.stack([np.cos(np.pi * k * (to_unit(np.asarray(motion.time)) + 1) / 2) for k in range(1, DEGREES)])
+
+
+def _chebyshev(x: Float[np.ndarray, "*shape"], degree: int) -> Float[np.ndarray, "degree+1 *shape"]:
+    """Chebyshev polynomials of each degree up to one."""
+    return np.moveaxis(np.polynomial.chebyshev.chebvander(x, degree), -1, 0)
+
+
+def to_unit(x: Float[np.ndarray, "nN *columns"]) -> Float[np.ndarray, "nN *columns"]:
+    """The values of each column brought to between -1 and 1."""
+    low, high = x.min(0), x.max(0)
+    return 2 * (x - low) / np.maximum(high - low, 1e-9) - 1

@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..effects.catalogue import CATALOGUE
+from ..effects.base import Effect
 from ..estimation import noise
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Prior, Rows, fit, tall
 from ..results import Name
+from .bank import Columns
 from .comparison import ground, judge_grown, t_value
 from .evidence import Score
 from .flexible import rich_families
 from .problem import Problem
-from .screening import Group, catalogue, screen
+from .screening import catalogue, exact_columns, screen
 from .state import State, plain_rows, solved, whitened
 from .step import stand
 from .thresholds import LOWEST_FREQUENCY, LOWEST_RESOLVED, T_REST
@@ -209,32 +211,41 @@ def _taken(problem: Problem, basis: Float[np.ndarray, "nvT columns"]) -> Float[n
     return np.moveaxis(basis.reshape(nv, n, length, -1), 0, 2)
 
 
+class _Taken(NamedTuple):
+    """A group that the rich model took, at a grid point: its `effect` there (None of a family), and what is kept of its
+    columns."""
+
+    name: Name
+    effect: Effect | None
+    kept: Float[np.ndarray, "k directions"]
+
+
 class _Rich(NamedTuple):
-    """The rich model: its rows, the state that its columns are evaluated at, and each group that it took, by name, grid
-    point and what is kept of its columns."""
+    """The rich model: its rows, the state that its columns are evaluated at, and each group that it took."""
 
     rows: Rows
     state: State
-    taken: list[tuple[Name, int, Float[np.ndarray, "k directions"]]]
+    taken: list[_Taken]
 
     @property
     def blocks(self) -> list[Float[np.ndarray, "nv T k"]]:
         """The columns of each group in the rows of all joints."""
-        ends = np.cumsum([kept.shape[1] for *_, kept in self.taken])
+        ends = np.cumsum([one.kept.shape[1] for one in self.taken])
         first = self.rows.X.shape[2] - (ends[-1] if len(ends) else 0)
         return np.split(self.rows.X[:, :, first:], ends[:-1], axis=2) if self.taken else []
 
 
 def _behind(problem: Problem, rich: _Rich, response: Float[np.ndarray, "F nv"]) -> Rows:
     """The rows of the rich model behind another response."""
-    rows = whitened(problem, rich.state, response)
-    names = [name for name, *_ in rich.taken]
-    others = [effect for effect in CATALOGUE if effect not in {name.effect for name in names}]
-    groups = catalogue(problem, rich.state, rows, response, others)
-    if titles := {name.effect for name in names} - {*CATALOGUE}:
-        groups += rich_families(problem, rich.state, response, few=False, titles=titles)
-    found = {group.name: group for group in groups}
-    more = [_full(rows, found[name], point) @ kept for name, point, kept in rich.taken]
+    state, rows = rich.state, whitened(problem, rich.state, response)
+    titles = {one.name.effect for one in rich.taken if one.effect is None}
+    families = rich_families(problem, state, response, few=False, titles=titles) if titles else []
+    found = {group.name: group.columns for group in families}
+    each = [
+        found[one.name] if one.effect is None else exact_columns(problem, state, rows, response, one.effect)
+        for one in rich.taken
+    ]
+    more = [_full(rows, columns, 0) @ one.kept for columns, one in zip(each, rich.taken, strict=True)]
     return rows._replace(X=np.concatenate([rows.X, *more], axis=2))
 
 
@@ -263,11 +274,12 @@ def _rich(
             break  # the best of so many that noise alone would have: without it, the residual would be less than noise
         point = int(np.argmax(scores[best].Q))
         kept = kept_columns(scores[best].root[point])
-        more = _full(rows, groups[best], point) @ kept
+        more = _full(rows, groups[best].columns, point) @ kept
         X = np.concatenate([rows.X, more], axis=2)
         gram = _grown_gram(gram, tall(X), tall(more))
         rows, prior = rows._replace(X=X, Xi=X), prior.extended(more.shape[2])
-        taken.append((groups[best].name, point, kept))
+        effect = jax.tree.map(lambda x, p=point: x[p], groups[best].effect)  # None stays what it is
+        taken.append(_Taken(groups[best].name, effect, kept))
     return _Rich(rows, state, taken)
 
 
@@ -284,10 +296,10 @@ def _largest_by_chance(scores: Sequence[Score]) -> float:
     return float(np.sqrt(2 * np.log(max(sum(len(result.z) for result in scores), 1))))
 
 
-def _full(rows: Rows, group: Group, point: int) -> Float[np.ndarray, "nv T k"]:
+def _full(rows: Rows, columns: Columns, point: int) -> Float[np.ndarray, "nv T k"]:
     """Columns of a group at a grid point, in the rows of all joints."""
-    full = np.zeros((*rows.y.shape, group.columns.Z.shape[1]))
-    full[list(group.columns.joints)] = np.moveaxis(group.columns.Z[point], 0, 2)
+    full = np.zeros((*rows.y.shape, columns.Z.shape[1]))
+    full[list(columns.joints)] = np.moveaxis(columns.Z[point], 0, 2)
     return full
 
 

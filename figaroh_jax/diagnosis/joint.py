@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..effects.base import Effect, exact
 from ..effects.catalogue import CATALOGUE, find
-from ..estimation.rows import Rows, block_sums
+from ..estimation.rows import Rows, block_sums, tall
 from ..results import Name
 from .comparison import fold_sums
 from .design import fitted_fields, kind, shapes, with_shape
@@ -229,8 +229,8 @@ def joint_fit(problem: Problem, step: Step, causes: list[Effect], whitening: Flo
     each = [slope for e in causes for slope in torque_slopes(problem, state, e, whitening)]
     slopes = np.stack(each) if each else np.zeros((0, *rows.y.shape))
     precision = np.append(state.prior.precision, np.zeros(len(slopes)))
-    cross = np.stack([np.tensordot(slope, rows.X, 2) for slope in slopes]) if each else np.zeros((0, rows.X.shape[2]))
     flat = slopes.reshape(len(slopes), rows.y.size)
+    cross = flat @ tall(rows.X)
     A = np.block([[step.folded.gram.sum(0), cross.T], [cross, flat @ flat.T]]) + np.diag(precision)
     inverse = _inverse(A)
     residual = rows.y - rows.X @ state.theta
@@ -269,9 +269,11 @@ def _scatter(
     rows: Rows, slopes: Float[np.ndarray, "shapes nv T"], residual: Float[np.ndarray, "nv T"]
 ) -> Float[np.ndarray, "P P"]:
     """sum_b g_b g_b' of the blocks' scores g_b = J_b' r_b: right for coloured residuals too. J are X and the slopes."""
-    blocks = rows.block.max() + 1
+    blocks, touched = rows.block.max() + 1, np.flatnonzero(slopes.any((0, 2)))
     linear = np.sum([block_sums(rows, r, x.T) for x, r in zip(rows.X, residual, strict=True)], axis=0)
-    others = np.sum([block_sums(rows, r, slopes[:, joint]) for joint, r in enumerate(residual)], axis=0)
+    others = np.zeros((len(slopes), blocks))
+    for joint in touched:
+        others += block_sums(rows, residual[joint], slopes[:, joint])
     scores = np.concatenate([linear, others])
     return scores @ scores.T * blocks / max(blocks - 1, 1)
 

@@ -94,6 +94,20 @@ class Part:
         return cls(lambda: made, (columns.shape[2], *columns.shape[:2]))
 
     @classmethod
+    def of_series(
+        cls,
+        series: Float[np.ndarray, "series nN"],
+        joint: Int[np.ndarray, " series"],
+        column: Int[np.ndarray, " series"],
+        shape: tuple[int, int],
+    ) -> Part:
+        """The part of columns each at one joint, in any order; `shape` are coordinates and columns."""
+        order = np.lexsort((column, joint))
+        order = order[np.asarray(series.any(1))[order]]
+        made = _Columns(series[order], joint[order], column[order])
+        return cls(lambda: made, (series.shape[1], *shape))
+
+    @classmethod
     def of_samples(cls, columns: Float[np.ndarray, "nN nv k"]) -> Part:
         """The part of columns that lie sample by sample."""
         joint, column = np.nonzero(columns.any(0))
@@ -412,52 +426,52 @@ class Problem:
     @cached_property
     def fixed(self) -> dict[str, Units]:
         """Unit torques of the effects that depend on the measured motion alone."""
-        return self.family("fixed", self.motion)
+        return self._family("fixed")
 
     @cached_property
     def plain(self) -> dict[str, tuple[Float[np.ndarray, "e k r n M"], Int[np.ndarray, "e r"]]]:
         """Rows, neither whitened nor weighted, of the effects that depend on the measured motion alone, and joints."""
         n, samples, _, _ = self.records.shape
-        out = {}
-        for given in [self.fixed, *self.shaped_in_parts()]:
+        left = {n: b for n, b in self.families["shaped"].items() if n not in self.unturned}
+        wanted, out = {name: np.ones(np.size(b.at[..., 0]), bool) for name, b in left.items()}, {}
+        for given in [self.fixed, *self.shaped_in_parts(wanted)]:
             for name, own in given.items():
                 torque = own.torque.reshape(*own.torque.shape[:3], n, samples)
                 known = out.get(name, ([], []))
                 out[name] = [*known[0], filter_rows(self.records, torque, fitted=True)], [*known[1], own.joints]
-        return {name: (np.concatenate(rows), np.concatenate(at)) for name, (rows, at) in out.items()}
+        return self.unturned | {name: (np.concatenate(rows), np.concatenate(at)) for name, (rows, at) in out.items()}
 
-    def family(self, name: str, motion: Motion) -> dict[str, Units]:
-        """Unit torques of a family, on one axis of places and grid points.
+    @cached_property
+    def unturned(self) -> dict[str, tuple[Float[np.ndarray, "e k r n M"], Int[np.ndarray, "e r"]]]:
+        """Of `plain`, what effects with a shape keep from a problem with another width of the friction's reversal."""
+        return {}
 
-        Of the effects that follow the torque each has a program of its own: it serves one of them as well.
-        """
-        if name == "following":
-            return {n: self.following(n, motion) for n in self.families[name]}
-        return units({n: flattened(b) for n, b in self.families[name].items()}, motion, self.records)
+    def _family(self, name: str) -> dict[str, Units]:
+        """Unit torques of a family of the measured motion, on one axis of places and grid points."""
+        return units({n: flattened(b) for n, b in self.families[name].items()}, self.motion, self.records)
 
-    def shaped_in_parts(
-        self, wanted: Mapping[str, Bool[np.ndarray, " effects"]] | None = None
-    ) -> Iterator[dict[str, Units]]:
-        """Unit torques of the effects with a shape: all at once, of long recordings a few of one effect at a time.
+    def shaped_in_parts(self, wanted: Mapping[str, Bool[np.ndarray, " effects"]]) -> Iterator[dict[str, Units]]:
+        """Unit torques of effects with a shape: all at once, of long recordings a few of one effect at a time.
 
         The torque of all grid points at all samples would be the largest thing in memory by far. `wanted` are the ones
-        asked for, on one axis of places and grid points; all of them by default.
+        asked for, on one axis of places and grid points.
         """
-        batches = self.families["shaped"]
-        wanted = {n: np.ones(np.size(b.at[..., 0]), bool) for n, b in batches.items()} if wanted is None else wanted
-        if len(self.motion.time) <= SHORT:
-            every = self.family("shaped", self.motion)
-            yield {name: own.of(wanted[name]) for name, own in every.items() if wanted[name].any()}
+        if wanted and len(self.motion.time) <= SHORT:
+            every = self._family("shaped")
+            yield {name: every[name].of(own) for name, own in wanted.items()}
             return
-        for name, batch in batches.items():
-            whole = flattened(batch)
+        for name in wanted:
+            whole = flattened(self.families["shaped"][name])
             for part in (slice(start, start + AT_ONCE) for start in range(0, len(whole.at), AT_ONCE)):
                 if wanted[name][part].any():
                     few = jax.tree.map(lambda x, part=part: np.asarray(x)[part], whole)
                     yield {name: units({name: few}, self.motion, self.records)[name].of(wanted[name][part])}
 
     def following(self, effect: str, motion: Motion) -> Units:
-        """Unit torques of one effect that follows the torque of the current model."""
+        """Unit torques of one effect that follows the torque of the current model.
+
+        Each has a program of its own: it serves one of them as well.
+        """
         return units({effect: flattened(self.families["following"][effect])}, motion, self.records)[effect]
 
     @cached_property
@@ -484,8 +498,11 @@ class Problem:
     def with_width(self, width: Float[np.ndarray, " nv"]) -> Problem:
         """The problem with another width of the friction's reversal, which no candidate's place and grid depends on."""
         other = replace(self, width=width)
-        same = ("torque", "read", "reached", "gain", "families")
+        same = ("torque", "read", "reached", "gain", "families", "unturned")
         other.__dict__.update({k: v for k, v in self.__dict__.items() if k in same})
+        if "plain" in self.__dict__:
+            shaped = self.families["shaped"].items()
+            other.__dict__["unturned"] = {n: self.plain[n] for n, batch in shaped if not batch.reverses}
         return other
 
 

@@ -275,9 +275,7 @@ def parts_of(
 def _dependences(problem: Problem, state: State, joint: int) -> list[tuple[Dependence, Float[np.ndarray, "k nN"]]]:
     """Smooth functions of the joint's position, velocity, load and time, and a constant for each recording."""
     records = problem.records
-    kinds: list[tuple[Dependence, np.ndarray]] = [
-        (kind, np.stack(columns)) for kind, columns in dependences(state.motion, joint).items()
-    ]
+    kinds: list[tuple[Dependence, np.ndarray]] = [*dependences(state.motion, joint).items()]
     fitted = [at for at in records.spans if records.fitted[at.slot, at.row : at.row + at.rows].any()]
     if len(fitted) > 1:
         constants = np.zeros((len(fitted), *records.shape[:2]))

@@ -23,7 +23,7 @@ from .bank import Bank, Columns, bank
 from .design import Units, flattened, kind, local, unit_rows, units
 from .evidence import Score, block_scores, largest, other_scores, projection, pulled, scores
 from .problem import Problem, without_factor
-from .state import State
+from .state import State, batched, unit_torques
 
 __all__ = [
     "CHUNK",
@@ -33,6 +33,7 @@ __all__ = [
     "Shown",
     "catalogue",
     "draw_noise",
+    "exact_columns",
     "family_p",
     "noise_squares",
     "place_p",
@@ -100,8 +101,8 @@ def catalogue(
     """Whitened columns of every effect that may be named, at every place and grid point.
 
     `before` are the groups of an earlier state of the same problem with the same response: columns that do not follow
-    the torque are kept. Where the friction of the joints `turned` reverses over another width since then, what acts
-    there, or at all joints, is evaluated anew, and all sensors.
+    the torque are kept. Where the friction of the joints `turned` reverses over another width since then, what follows
+    that there, or at all joints, is evaluated anew.
     """
     taken = {(type(e).name, at) for term in state.terms for e, at in _places_of(term)}
     taken |= {(effect.name, tuple(int(i) for i in np.asarray(effect.at))) for effect in state.sensors}
@@ -121,7 +122,7 @@ def catalogue(
             columns = fresh.get(name, {}).get(place, known.columns if known else None)
             if columns is None and batches[name].inertial:
                 columns = _link_columns(rows, at[0], problem.model)
-            if columns is not None and np.abs(columns.Z).max() > 0:
+            if columns is not None and columns.Z.any():
                 one = known.effect if known else jax.tree.map(lambda x, p=place: np.asarray(x)[p], batches[name])
                 groups.append(Group(title, one, columns))
     return groups
@@ -141,7 +142,8 @@ def _fresh_columns(
     weight, out = np.moveaxis(np.asarray(problem.records.weight), 2, 0), {}
     parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
 
-    measured = {n: b for family in ("fixed", "shaped") for n, b in problem.families[family].items()}
+    fixed, shaped = (problem.families[family] for family in ("fixed", "shaped"))
+    measured = {n: b for n, b in (fixed | shaped).items() if n in wanted}
     asked = {n: np.arange(len(b.at)) for n, b in batches.items()}
     asked |= {n: np.flatnonzero(_turned(b, turned)) for n, b in measured.items() if turned is not None}
 
@@ -161,12 +163,11 @@ def _fresh_columns(
     for name, (rows, at) in (problem.plain if plain else {}).items():
         if name in wanted:
             placed(name, rows * (weight * factor[:, None, None])[at][:, None], at)
-    everything = turned is None or len(turned) > 0
     masks = {n: np.repeat(np.isin(np.arange(len(b.at)), asked[n]), b.at.shape[1]) for n, b in measured.items()}
-    masks = masks if everything and not plain else {}
-    for family in _fresh_families(problem, state, wanted, everything, masks):  # samples of one family at a time
-        for name in (n for n in family if n in wanted):
-            placed(name, unit_rows(family[name], problem.records, response), family[name].joints)
+    masks = {} if plain else {name: mask for name, mask in masks.items() if mask.any()}
+    for family in _fresh_families(problem, state, wanted, turned is None, masks):  # samples of one family at a time
+        for name, given in family.items():
+            placed(name, unit_rows(given, problem.records, response), given.joints)
     return out
 
 
@@ -179,19 +180,31 @@ def _fresh_families(
 ) -> Iterator[Mapping[str, Units]]:
     """Unit torques at all samples, a family after another; of the effects of the measured motion alone those that are
     named in `measured`, on one axis of places and grid points."""
-    yield problem.family("following", state.motion)
-    if measured:
-        yield {name: own.of(measured[name]) for name, own in problem.fixed.items() if measured[name].any()}
-        yield from problem.shaped_in_parts(measured)
+    yield {n: problem.following(n, state.motion) for n in problem.families["following"] if n in wanted}
+    if fixed := [n for n in problem.families["fixed"] if n in measured]:
+        yield {n: problem.fixed[n].of(measured[n]) for n in fixed}
+    yield from problem.shaped_in_parts({n: measured[n] for n in problem.families["shaped"] if n in measured})
     sensors = {n: b for n, b in problem.families["sensor"].items() if n in wanted and (everything or b.follows_torque)}
     late = [n for n in sensors if kind(sensors[n]) == "response"]  # one program
     for names in [late, *([n] for n in sensors if n not in late)]:
         yield units({n: flattened(sensors[n]) for n in names}, state.motion, problem.records)
 
 
+def exact_columns(
+    problem: Problem, state: State, rows: Rows, whitening: Float[np.ndarray, "F nv"], effect: Effect
+) -> Columns:
+    """Whitened columns of one effect alone, its shape as it is, as `catalogue` has them."""
+    if effect.inertial:
+        return _link_columns(rows, int(np.asarray(effect.at)[0]), problem.model)
+    given = unit_torques(problem, state, batched(effect))
+    response = whitening * state.response(problem.records.omega)[:, None]
+    Z = unit_rows(given, problem.records, response)
+    return Columns(tuple(given.joints[0].tolist()), Z.reshape(*Z.shape[:3], -1))
+
+
 def _turned(batch: Effect, joints: Collection[int]) -> Bool[np.ndarray, " places"]:
     """At which places an effect of the measured motion follows how the friction of the `joints` reverses."""
-    at = np.asarray(batch.at)[:, 0]
+    at, joints = np.asarray(batch.at)[:, 0], joints if batch.reverses else ()
     return np.asarray(np.isin(at, list(joints)).any(axis=1)) if local(batch) else np.full(len(at), len(joints) > 0)
 
 

@@ -195,9 +195,14 @@ class _Few(NamedTuple):
     def between(self, slopes: Float[np.ndarray, "*lead n_few"]) -> Float[np.ndarray, "*lead n N"]:
         """Values at all samples of each recording."""
         slopes = slopes.reshape(*slopes.shape[:-1], -1, len(self.at))
-        low = np.minimum(np.arange(self.samples) // EVERY, len(self.at) - 2)
-        share = (np.arange(self.samples) - self.at[low]) / (self.at[low + 1] - self.at[low])
-        return slopes[..., low] * (1 - share) + slopes[..., low + 1] * share
+        begin, rise = slopes[..., :-1], np.diff(slopes) / np.diff(self.at)
+        out = np.empty((*slopes.shape[:-1], self.samples))
+        for k in range(EVERY):  # samples behind those at which the slopes are known
+            own = out[..., k:-1:EVERY]
+            np.multiply(rise[..., : own.shape[-1]], k, out=own)
+            own += begin[..., : own.shape[-1]]
+        out[..., -1] = slopes[..., -1]
+        return out
 
 
 def _errors(
@@ -353,10 +358,13 @@ def shift_torques(effects: Effect, motion: Motion, records: Records) -> Float[np
     loads = _load_slopes(motion, records)
     out = np.empty((*errors.shape[:2], loads.shape[2], loads.shape[3]))
     for one, joint in enumerate(np.asarray(effects.at)[:, 0].tolist()):
-        parts = (x[one].reshape(len(names), 1, -1) for x in (errors, rates, pushes))
-        out[one] = -sum(slope[joint] * part for slope, part in zip(loads, parts, strict=True))
+        for unit, parts in zip(out[one], zip(errors[one], rates[one], pushes[one], strict=True), strict=True):
+            unit[:] = 0.0
+            for slope, part in zip(loads, parts, strict=True):
+                unit -= slope[joint] * part.reshape(-1)
     # a joint whose position shows in no torque has columns of rounding alone
-    out[np.abs(out).max((2, 3)) < ROUNDING * np.abs(loads).max()] = 0.0
+    largest = max(loads.max(), -loads.min())
+    out[np.maximum(out.max((2, 3)), -out.min((2, 3))) < ROUNDING * largest] = 0.0
     return out
 
 

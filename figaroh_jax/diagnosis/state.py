@@ -111,12 +111,14 @@ class State:
         self, load: Float[np.ndarray, "rows nv"], theta: Float[np.ndarray, " P"], rows: slice = slice(None)
     ) -> Float[np.ndarray, "rows nv"]:
         """The load with the torque of each term; what cuts it comes last."""
-        total, cutting = load.copy(), []
+        terms = np.zeros(load.shape[::-1]).T  # a joint's samples follow one another
+        cutting = []
         for term, part, own in zip(self.terms, self.parts[1:], self._of_terms(theta), strict=True):
             if self.cut is not None and term.has("through"):
                 cutting.append((part, own))
             else:
-                part.add(own, total, rows)
+                part.add(own, terms, rows)
+        total = np.add(load, terms, order="C")
         if self.cut is not None:
             total = self.cut.through[rows] * total + self.cut.torque[rows]
         for part, own in cutting:
@@ -276,7 +278,8 @@ def with_width(problem: Problem, state: State) -> State:
         return state
     moved = replace(state, measured=problem.motion)
     pairs = list(zip(state.terms, state.parts[1:], strict=True))
-    parts = [part if term.follows_total else _term_columns(problem, moved, term) for term, part in pairs]
+    same = [term.follows_total or not term.reverses for term in state.terms]
+    parts = [p if own else _term_columns(problem, moved, term) for (term, p), own in zip(pairs, same, strict=True)]
     moved = replace(moved, parts=(state.rigid, *parts))
     if not any(term.follows_total for term in state.terms):
         return moved
@@ -389,10 +392,11 @@ def _term_columns(problem: Problem, state: State, term: Effect) -> Part:
 
 def _columns(problem: Problem, state: State, term: Effect) -> Part:
     given = unit_torques(problem, state, term)
-    columns = np.zeros((problem.model.nv, *given.torque.shape[:2], given.torque.shape[3]))
-    for one, joints in enumerate(given.joints):
-        np.add.at(columns[:, one], joints, given.torque[one].swapaxes(0, 1))
-    return Part.of(columns.reshape(problem.model.nv, -1, columns.shape[-1]))
+    places, count, rows, samples = given.torque.shape
+    joint = np.broadcast_to(given.joints[:, None], (places, count, rows)).reshape(-1)
+    column = np.repeat(np.arange(places * count), rows)
+    shape = problem.model.nv, places * count
+    return Part.of_series(given.torque.reshape(-1, samples), joint, column, shape)
 
 
 def _rigid(problem: Problem, motion: Motion) -> Part:

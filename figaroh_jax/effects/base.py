@@ -288,6 +288,7 @@ class Effect(eqx.Module):
     acts_on: ClassVar[Literal["joint", "pair", "link", "robot", "frame"]]  # frame: of base or tool, in postures
     follows_torque: ClassVar[bool] = False  # whether its torque depends on the current model's (load or total)
     follows_total: ClassVar[bool] = False  # whether it depends on all torque together, as a drive or a sensor does
+    reverses: ClassVar[bool] = True  # whether its torque may follow how dry friction reverses (`Motion.direction`)
     inertial: ClassVar[bool] = False  # whether its amplitudes are ten parameters of its link: the regressor's columns
     body: ClassVar[bool] = False  # whether these are a body's that exists: mass > 0, pseudo-inertia >= 0
     levels: ClassVar[tuple[str, ...]] = ("torque", "pose", "rollout")  # of diagnoses that look for it

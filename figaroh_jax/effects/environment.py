@@ -48,6 +48,7 @@ class PointEffect(Effect):
     """A force on a point of a link, fixed in the link's joint frame (m)."""
 
     acts_on = "link"
+    reverses = False
 
     @classmethod
     def may_act(cls, model: RobotModel, place: int) -> bool:

@@ -41,6 +41,7 @@ class ViscousFriction(JointEffect):
 
     name, title = "viscous_friction", "viscous friction"
     dissipative = True
+    reverses = False
     equation = "damping v"
     separated_by = "constant-speed sweeps of {at} at five or more speeds up to its maximum"
     in_rollouts = InRollouts(
@@ -105,6 +106,7 @@ class AsymmetricViscousFriction(JointEffect):
     name, title = "asymmetric_viscous_friction", "direction-dependent viscous friction"
     levels = ("torque", "pose")  # in rollouts it acts where a model has it, but is not looked for
     rubs = True
+    reverses = False
     equation = "difference |v|"
     separated_by = "sweeps of {at} in both directions over its whole range of speed"
     difference: Scalar = amplitude("N m s/rad")

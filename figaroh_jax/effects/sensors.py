@@ -36,6 +36,7 @@ class TorqueOffset(JointEffect):
 
     name, title = "torque_offset", "torque offset"
     of_position = True
+    reverses = False
     equation = "offset"
     separated_by = "a dwell of {at} with the brake on or the motor unloaded"
     in_rollouts = InRollouts((("offset", "offset"),), lambda scale: ((0.0,),), constant=True)

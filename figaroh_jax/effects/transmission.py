@@ -34,6 +34,7 @@ class RotorInertia(JointEffect):
     """Inertia of the motor and gears, seen through the gear ratio (armature)."""
 
     name, title = "rotor_inertia", "rotor inertia"
+    reverses = False
     equation = "inertia a"
     separated_by = "fast motion of {at} in several postures of the joints beyond it"
     in_rollouts = InRollouts((("inertia", "armature"),), lambda scale: ((HERE,),), usual=True, signed=False)
@@ -95,6 +96,7 @@ class TorqueRipple(JointEffect):
     """Torque that repeats with the position: cogging, teeth, bearings."""
 
     name, title = "torque_ripple", "torque ripple"
+    reverses = False
     equation = "sine sin(order q) + cosine cos(order q)"
     separated_by = "sweeps of {at} at two constant speeds: the order stays, the frequency moves"
     in_rollouts = InRollouts(
@@ -123,6 +125,7 @@ class JointSpring(JointEffect):
     name, title = "joint_spring", "joint spring"
     contains = ("torque_offset",)
     of_position = True
+    reverses = False
     equation = "stiffness (q - rest)"
     separated_by = "motion of {at} over a larger range, or with the base turned"
     in_rollouts = InRollouts(
