@@ -95,3 +95,13 @@ def test_a_ripple_beside_joints_that_stick_is_not_told_as_noise(size: float, see
     """In closed loop what sticks leaves the most; the ripple had been told as noise, and the rest as sticks alone."""
     case = make_stiction_case([("torque_ripple", size, ("joint_3",))], "tx40", repeats=1, trajectories=4, seed=seed)
     assert diagnosed(case, ["torque_ripple"]).verdict == "unknown", seed
+
+
+@pytest.mark.skipif(not robots.available("ur10e"), reason="FIGAROH_JAX_DATA has no ur10e")
+@pytest.mark.parametrize("seed", [3002095554, 1639379783])
+def test_joints_that_break_loose_are_no_effect(seed: int):
+    """The others' motion foretold a joint beside those that stick, in which nothing is missing: it had been `unknown`.
+
+    A joint that breaks loose jerks its neighbours as no filtered acceleration shows.
+    """
+    assert diagnosed(make_stiction_case([], "ur10e", repeats=1, trajectories=4, seed=seed)).verdict == "nothing"

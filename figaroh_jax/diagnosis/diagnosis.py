@@ -328,7 +328,11 @@ def _judged(
     sticks = (shown or (large and not named)) and not law
     sticks = sticks and (sticks_alone(here, joint, tolerance) or sticks_alone(searched.here, by_speed, tolerance))
     told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
-    if sticks and not named and roughly_predictable(problem, told, whitening, tolerance, ~resting(problem).any(2)):
+    if (
+        sticks
+        and not named
+        and roughly_predictable(problem, told, whitening, tolerance, ~np.any(resting(problem), axis=2))
+    ):
         shown, sticks = True, False  # what sticks, and something that moves and passed for noise
     rest, read = shown and not sticks, False
     if rest and not named and left.line[0] >= LINE_P:  # a line is none of what reading a motion leaves
