@@ -316,14 +316,16 @@ def _limit_contender(
     problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], group: Group, order: np.ndarray
 ) -> Contender:
     """A drive at its limit, all coefficients fitted with it: where it holds, the torque says nothing of them."""
-    effect = with_shape(jax.tree.map(lambda x: x[order[0]], group.effect), group.effect.amplitudes(), [np.float64(1.0)])
+    names, declared = group.effect.amplitudes(), group.effect.parameters()
+    whole = [np.float64(1.0) for _ in names]
+    effect = with_shape(jax.tree.map(lambda x: x[order[0]], group.effect), names, whole)
     joints = acting(effect, len(step.rows.y), group.columns.joints)
     for turns in (0, POLISH):
         here = polished(problem, step.state, [effect], whitening, turns)
         (effect,), free = here.causes, step.loose and here.step.free
         one = Contender(group.name, effect, here.step.verdicts, joints, free)
-        bounds = effect.parameters()["share"]
-        if not (worth_trying(step, one) and bounds.lower < float(effect.share) < bounds.upper):
+        inside = all(declared[n].lower < float(getattr(effect, n)) < declared[n].upper for n in names)
+        if not (inside and worth_trying(step, one)):
             break
     return one
 
