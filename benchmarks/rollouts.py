@@ -371,7 +371,8 @@ def so101_speed() -> None:
         one, mine = alone(loop, [run], carried, j)
         total += _sums_seconds(setting(one, mine, stretches=cut))
     print(
-        f"squares and sensitivities of {len(run.time) * PERIOD:.0f} s: arm {1e3 * whole:.1f} CPU ms, joints {1e3 * total:.1f}"
+        f"squares and sensitivities of {len(run.time) * PERIOD:.0f} s, CPU ms: arm {1e3 * whole:.1f}, joints"
+        f" {1e3 * total:.1f}"
     )
 
 

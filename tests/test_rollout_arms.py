@@ -128,6 +128,22 @@ def test_what_a_later_cause_made_needless_is_not_named(tmp_path: Path):
     assert [n.candidate[:2] for n in found.named] == [("voltage_saturation", ("lift",))]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("joint", "share", "seed"), [(1, 0.4, 1001381), (2, 0.35, 12)])
+def test_a_drive_that_lets_its_joint_fall_is_told_by_its_limit(tmp_path: Path, joint: int, share: float, seed: int):
+    """A lift whose drive is at its limit nearly always, and an elbow for a quarter of the time: a baseline without the
+    limit holds the lift up with friction a hundred times too large, from which no step leads to the limit."""
+    (tmp_path / "arm.xml").write_text(servo_arm6.model_text(1.6))
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    recordings = [servo_arm6.record([("voltage_saturation", joint, share)], seed, k) for k in range(2)]
+    runs = [Run(f"run {k}", r["t"], r["u"], r["q"], None) for k, r in enumerate(recordings)]
+    found = search_arm(setting(loop, runs, stretches=[Stretch(k, f, 600) for k in range(2) for f in (0, 600)]))
+    (one,) = found.named
+    assert one.candidate[:2] == ("voltage_saturation", (servo_arm6.NAMES[joint],))
+    limit = found.last.theta[one.candidate.entries[0]]
+    assert limit == pytest.approx(share * 0.25 * servo_arm6.KP[joint], rel=1e-3)
+
+
 def test_one_linear_step_promises_what_least_squares_gives():
     """Numbers of all windows and the states at each window's start; columns that are left out stay where they are."""
     rng, numbers, states, windows_, rows = np.random.default_rng(5), 4, 2, 3, 30

@@ -7,7 +7,7 @@ a fit, and a joint that is off by as much as when it was looked at last is not l
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +17,7 @@ from .causes import Candidate, elastic_loop, springs
 from .fit import Fit, fit
 from .loop import Loop
 from .own import is_own
-from .parameters import OF_DRIVES, OF_SEVERAL, Entry
+from .parameters import OF_DRIVES, OF_SEVERAL, Entry, values
 from .search import Model, Tried, scored, settled
 from .sensitivity import Windows
 from .setting import (  # fmt: skip
@@ -53,6 +53,8 @@ _TOP, _RACE = 3, 2  # candidates of a joint that are fitted, and that are fitted
 _PART = 3  # of the windows, one in so many shows whether a limit or a spring is worth a fit
 _SHARES = (0.005, 0.05, 0.3)  # twists of a spring under the largest torque, rad or m
 _PLAYS = (0.1, 0.4, 1.5)  # of a spring's twist under the largest torque
+_LOWER = (0.45, 0.2)  # times a limit's starts: a stalled drive is asked for many times what it gives
+_ABOVE = 1.3  # times where a limit's fit has ended: from there it is fitted once more
 
 
 class Standing(NamedTuple):
@@ -110,6 +112,7 @@ def tried_now(
         and ((joint_of(here, c) < 0 and -1 not in same) or joint_of(here, c) in open_joints)
     ]  # fmt: skip
     own, cost = now.squares.sum((0, 1)), model.fit.cost
+    bare = {j for j in open_joints if not any(joint_of(here, c) == j for c in named)}
     plain = [c for c in left if not c.kind.limit]
     best: dict[int, list[_Ranked]] = {}
     for k, (score, theta) in scored(here, model, plain).items():
@@ -119,7 +122,9 @@ def tried_now(
         if common and now.excess[j] >= 1.0:  # nothing that few joints have can come before it
             best[j] = [max(common, key=lambda one: one.promise)]
             continue
-        best.setdefault(j, []).extend(_limits_and_springs(here, now, left, best.get(j, []), j, rigid, forbid))
+        best.setdefault(j, []).extend(
+            _limits_and_springs(here, now, left, best.get(j, []), j, rigid, forbid, j in bare)
+        )
     hopeful: dict[int, list[_Ranked]] = {}
     for j, ones in best.items():
         ranked = sorted(ones, key=lambda one: -one.promise)
@@ -135,7 +140,7 @@ def tried_now(
         hopeful[j] = chosen + [
             one for one in ranked if _asked_by(one.candidate, chosen) and all(one is not x for x in chosen)
         ]
-    found = _fitted(here, now, hopeful)
+    found = _fitted(here, now, hopeful, bare)
     for j in (-1, *open_joints) if -1 not in same else open_joints:
         known[j] = _Seen(sizes[j], [one for one in found if joint_of(here, one.candidate) == j], [])
     return stands + found
@@ -152,9 +157,12 @@ def _as_now(now: Standing, joint: int, one: Tried) -> Tried:
 
 def _limits_and_springs(
     here: Setting, now: Standing, left: Sequence[Candidate], plain: Sequence[_Ranked], joint: int, rigid: bool,
-    forbid: Sequence[str],
+    forbid: Sequence[str], bare: bool,
 ) -> list[_Ranked]:  # fmt: skip
-    """What changes the model before it can be differentiated, ranked on the windows where the joint is off the most."""
+    """What changes the model before it can be differentiated, ranked on the windows where the joint is off the most.
+
+    `bare`: the joint has no cause yet, so that its baseline may stand for one of its drive.
+    """
     (part, share, _), model = _part(now, joint), now.model
     mine = [c for c in left if joint_of(here, c) == joint]
     leader = max(plain, key=lambda one: one.promise, default=None)
@@ -163,6 +171,10 @@ def _limits_and_springs(
         best = leader.candidate._replace(starts=(tuple(leader.theta[list(leader.candidate.entries)]),))
         chosen = [best if c is leader.candidate else c for c in chosen]
     scores = {chosen[k].effect: (part.fit.cost - x, theta) for k, (x, theta) in scored(here, part, chosen).items()}
+    if bare and now.excess[joint] >= 1.0:
+        for effect, (promise, theta) in _limits_as_filed(here, part, chosen, joint).items():
+            if promise > scores.get(effect, (0.0, theta))[0]:
+                scores[effect] = promise, theta
     if leader is not None and scores.get(leader.candidate.effect, (0.0, None))[0] > 0:
         share = leader.promise / scores[leader.candidate.effect][0]  # as much more as the same cause promises in all
     found = [
@@ -176,6 +188,26 @@ def _limits_and_springs(
     elif much:
         found += [one._replace(promise=one.promise * share) for one in _looser(here, now, joint, forbid)]
     return found
+
+
+def _limits_as_filed(
+    here: Setting, part: Model, chosen: Sequence[Candidate], joint: int
+) -> dict[str, tuple[float, np.ndarray]]:
+    """What limits of a joint's drive promise from the numbers of the model file, by effect, and from which numbers."""
+    limits = [c._replace(starts=tuple((b * x,) for b in _LOWER for (x,) in c.starts)) for c in chosen if c.kind.limit]
+    begin = {"theta": _as_filed(here, part.fit.theta, joint), "start": np.asarray(part.structure.data.start)}
+    found = scored(here, part._replace(fit=part.fit._replace(**begin)), limits)
+    return {limits[k].effect: (part.fit.cost - cost, theta) for k, (cost, theta) in found.items()}
+
+
+def _as_filed(here: Setting, theta: np.ndarray, joint: int) -> np.ndarray:
+    """The numbers of a model, what the baseline frees at a joint as in the model file.
+
+    A baseline without a drive's limit holds up with friction what the drive lets fall.
+    """
+    mine, filed = [k for k in here.baseline if joint_of_entry(here, k) == joint], theta.copy()
+    filed[mine] = values(here.loop, here.known.table)[mine]
+    return filed
 
 
 def _looser(here: Setting, now: Standing, joint: int, forbid: Sequence[str]) -> list[_Ranked]:
@@ -230,8 +262,9 @@ def _rows(here: Setting, joint: int) -> int:
 
 
 def _asked_by(one: Candidate, others: Sequence[_Ranked]) -> bool:
-    """Whether another is more of it, or may stand for it: then it must have been fitted too."""
-    return any(one.effect in (x.candidate.kind.adds_to, x.candidate.kind.rival_of) for x in others)
+    """Whether another is more of it, or may stand for it, as limits of a drive do: it has to be fitted too then."""
+    kinds = [x.candidate.kind for x in others]
+    return any(one.effect in (x.adds_to, x.rival_of) or (one.kind.limit and x.limit) for x in kinds)
 
 
 def _no_more(one: _Ranked, ranked: Sequence[_Ranked]) -> bool:
@@ -240,7 +273,7 @@ def _no_more(one: _Ranked, ranked: Sequence[_Ranked]) -> bool:
     return any(kind.holds(other.candidate.effect) and one.promise < RICHER * other.promise for other in ranked)
 
 
-def _fitted(here: Setting, now: Standing, hopeful: dict[int, list[_Ranked]]) -> list[Tried]:
+def _fitted(here: Setting, now: Standing, hopeful: dict[int, list[_Ranked]], bare: Collection[int]) -> list[Tried]:
     """Candidates of all joints: a few steps of each, then those that may win to the end.
 
     One of each joint share a fit, for each joint's encoder judges its own: what another joint lacks hardly moves it.
@@ -259,8 +292,9 @@ def _fitted(here: Setting, now: Standing, hopeful: dict[int, list[_Ranked]]) -> 
         first += [x for x in ordered if all(x is not y for y in first) and x[0] < before
                   and _asked_by(x[1].candidate, [y[1] for y in near[:_RACE]])]  # fmt: skip
         leaders[j] = [(x[1], x[2]) for x in first]
+    last = _all_in_lanes(here, now, leaders, LATE, now.model.fit.cost)
     found = []
-    for one in _all_in_lanes(here, now, leaders, LATE, now.model.fit.cost):
+    for one in _limits_anew(here, last, bare):
         c, beyond = one.ranked.candidate, excess_of(here, one.ranked.structure, one.fit)
         own = float(beyond.max() if one.joint < 0 else beyond[one.joint])
         state = Model(one.ranked.structure, one.fit, one.free, own)
@@ -270,6 +304,41 @@ def _fitted(here: Setting, now: Standing, hopeful: dict[int, list[_Ranked]]) -> 
             sse[..., one.joint] = mine
         found.append(Tried(c, state, sse, one.alone))
     return found
+
+
+def _limits_anew(here: Setting, fits: Sequence[_OneOf], bare: Collection[int]) -> list[_OneOf]:
+    """The fits, those of a drive's limit that leave more than noise begun again; the better ends.
+
+    A limit that a step has put too low lets the joint fall, and no step leads back: it is begun from above, and from
+    where the best of the joint's limits has ended, the baseline as in the model file.
+    """
+    found, ends = list(fits), dict[int, float]()
+    for again in range(2):
+        for k, one in enumerate(found):
+            if not (one.ranked.candidate.kind.limit and one.alone and one.joint in bare):
+                continue
+            (entry,) = one.ranked.candidate.entries
+            begin = _ABOVE * float(one.fit.theta[entry]) if not again else ends[one.joint]
+            if again and begin == float(one.fit.theta[entry]):
+                continue  # it is the best one itself
+            found[k] = _limit_from(here, one, begin)
+        for one in sorted((x for x in found if x.ranked.candidate.kind.limit), key=lambda x: -x.fit.cost):
+            ends[one.joint] = float(one.fit.theta[one.ranked.candidate.entries[0]])
+    return found
+
+
+def _limit_from(here: Setting, one: _OneOf, limit: float) -> _OneOf:
+    """A drive's limit fitted once more from this one and the model file's numbers, where that leaves less."""
+    structure = one.ranked.structure
+    if excess_of(here, structure, one.fit)[one.joint] < 1.0:
+        return one
+    theta = _as_filed(here, one.fit.theta, one.joint)
+    theta[list(one.ranked.candidate.entries)] = limit
+    other = fit(*structure, theta[None], [one.free], np.asarray(structure.data.start)[None],
+                width=max(here.width, len(one.free)), lanes=1, iterations=LATE, rough=ROUGH / 10)[0]  # fmt: skip
+    if not other.cost < one.fit.cost:
+        return one
+    return one._replace(fit=other, own=float(outputs(here, other.sums.cost)[..., one.joint].sum()))
 
 
 class _OneOf(NamedTuple):
