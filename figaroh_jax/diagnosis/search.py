@@ -27,7 +27,17 @@ from .problem import Problem
 from .screening import DRAWS, Null, Screen, Shown, catalogue, family_p, place_p, screen
 from .state import State, solved, with_width
 from .step import Step, stand, with_cause, with_causes
-from .thresholds import GAIN, MOST_CAUSES, OUTDONE, OVERLAP_ELSEWHERE, SHARE_AGAIN, SHARE_ALIKE, SMALLEST, T_BETTER
+from .thresholds import (
+    GAIN,
+    MOST_CAUSES,
+    MOST_OF_A_GAIN,
+    OUTDONE,
+    OVERLAP_ELSEWHERE,
+    SHARE_AGAIN,
+    SHARE_ALIKE,
+    SMALLEST,
+    T_BETTER,
+)
 
 __all__ = [
     "Begun",
@@ -340,6 +350,7 @@ def _found(
     own = float(wins[0] + wins[1:][outer].sum())
     # where the links are not well known, those that they can stand for are no names
     apart = np.array([problem.trust <= c.effect.needs_trust and physical_sign(c.effect) for c in alike], bool)
+    apart &= np.array([not _takes_most(step, best, c) for c in alike], bool)
     return Found(
         name=best.name,
         effect=best.effect,
@@ -354,6 +365,16 @@ def _found(
         instead=tuple(Rival(c.name, c.effect, c.joints) for c in alike if c.name in open_to),
         outdone=own < OUTDONE * (own + wins[1:][apart & ~outer].sum()),
     )
+
+
+def _takes_most(step: Step, best: Contender, rival: Contender) -> bool:
+    """Whether a joint's cause gains most of what a body in its place does.
+
+    A link's ten numbers hold the inertia of a rotor at its joint, and follow what else goes with the link's motion: that
+    it predicts better by these is another misfit.
+    """
+    gain, most = (step.verdicts.heldout - c.verdicts.heldout for c in (best, rival))
+    return best.effect.acts_on == "joint" and rival.effect.body and gain > MOST_OF_A_GAIN * most
 
 
 def eliminate(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> list[Found]:
