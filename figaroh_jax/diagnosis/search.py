@@ -370,8 +370,8 @@ def _found(
 def _takes_most(step: Step, best: Contender, rival: Contender) -> bool:
     """Whether a joint's cause gains most of what a body in its place does.
 
-    A link's ten numbers hold the inertia of a rotor at its joint, and follow what else goes with the link's motion: that
-    it predicts better by these is another misfit.
+    A link's ten numbers hold the inertia of a rotor at its joint, and follow what else goes with the link's motion:
+    what it predicts better by these is another misfit.
     """
     gain, most = (step.verdicts.heldout - c.verdicts.heldout for c in (best, rival))
     return best.effect.acts_on == "joint" and rival.effect.body and gain > MOST_OF_A_GAIN * most
