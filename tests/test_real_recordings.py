@@ -14,6 +14,7 @@ import pytest
 from figaroh_jax.diagnosis.diagnosis import diagnose_task
 from figaroh_jax.formats.config import load_task
 from figaroh_jax.identification.identification import identify_task
+from figaroh_jax.results import Name
 
 pytest.importorskip("pinocchio")  # the sets are written with it
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -22,7 +23,7 @@ from benchmarks import blackbox
 from benchmarks.hide_in_real.generate import twin_of
 
 SETS = {  # the relative error that causes leave at most, with what it was when this was written
-    "ur10e": 0.050,  # .0467
+    "ur10e": 0.048,  # .0468; .0488 without the shoulder's rotor
     "panda": 0.0118,  # .0114
     "tiago": 0.1295,  # .1283
     "kuka": 0.0320,  # .0284
@@ -30,6 +31,7 @@ SETS = {  # the relative error that causes leave at most, with what it was when 
     "dfki_double_pendulum": 0.283,  # .2792
 }
 VERDICTS = {"panda": "unknown"}  # 16 % of a torque are left, and what is refused predicts what was kept out
+NAMED = {"ur10e": Name("rotor_inertia", ("shoulder_lift_joint",))}  # all its joints turn rotors behind gears of 100:1
 EXPLAINED = {"kuka": (0.58, 0.999, 0.96, 0.986, 0.37)}  # R2 of each of the first joints, kept out, at least
 
 
@@ -48,6 +50,7 @@ def test_the_error_on_recordings_kept_out_is_no_larger_than_that_of_identify(
     torque = [np.asarray(kept.rms) / np.asarray(kept.relative) for kept in plain.holdout.values()]
     identified = np.sqrt(sum((r**2).sum() for r in rms) / sum((t**2).sum() for t in torque))
     assert found.verdict == VERDICTS.get(name, found.verdict)
+    assert name not in NAMED or NAMED[name] in [cause.name for cause in found.causes]
     assert found.holdout.after <= found.holdout.before
     assert found.holdout.after <= identified
     assert found.holdout.after <= SETS[name]

@@ -328,7 +328,7 @@ def _limits_anew(here: Setting, fits: Sequence[_OneOf], bare: Collection[int]) -
 
 
 def _limit_from(here: Setting, one: _OneOf, limit: float) -> _OneOf:
-    """A drive's limit fitted once more from this one and the model file's numbers, where that leaves less."""
+    """A fit of a drive's limit, or one begun at `limit` with the model file's baseline where that leaves less."""
     structure = one.ranked.structure
     if excess_of(here, structure, one.fit)[one.joint] < 1.0:
         return one
