@@ -13,16 +13,28 @@ from .joint import Joint, polished, with_misfit, with_parts
 from .problem import Problem
 from .search import Found
 from .setting import Setting
+from .standstill import resting
 from .step import stand
 from .thresholds import FEWER, STANDSTILL, WHITE_GAIN
 from .weights import relative_speed
 
-__all__ = ["as_predicts_best", "as_weighed_in_motion", "as_weighed_otherwise", "together"]
+__all__ = ["as_moves", "as_predicts_best", "as_weighed_in_motion", "as_weighed_otherwise", "together"]
 
 
 def together(here: Setting, found: list[Found]) -> Joint:
     """The causes in one fit."""
     return polished(here.problem, here.start, [one.effect for one in found], here.whitening)
+
+
+def as_moves(here: Setting) -> Joint:
+    """The model without any cause, fitted to the rows in which each joint moves.
+
+    Rows at rest say of its friction no more than that it is at least as much: beside many of them the friction that
+    slides is told too small.
+    """
+    moving = np.asarray(here.problem.records.judged) * ~resting(here.problem)
+    level = np.ones_like(here.whitening) / np.maximum(residual_rms(here.problem, here.start), 1e-300)
+    return together(here._replace(problem=here.problem.weighted(moving), whitening=level, white=True), [])
 
 
 def as_predicts_best(

@@ -29,7 +29,7 @@ from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
 from ..simulators.native import as_backend
 from ..simulators.registry import backend as make_backend
-from .answer_fit import as_predicts_best, as_weighed_in_motion, as_weighed_otherwise, together
+from .answer_fit import as_moves, as_predicts_best, as_weighed_in_motion, as_weighed_otherwise, together
 from .believed import impossible_links
 from .estimates import amplitude_places, estimates, fitted_model
 from .experiment import next_experiment
@@ -39,7 +39,7 @@ from .floor import foretold, noise_rms, short, sober_spectrum, undecided
 from .gaining import Gaining, beside_all, predicts_better, without_losses
 from .gates import physical_sign
 from .holdout import residual_rms, traces
-from .joint import Joint, least_sure, opened, polished, sized, with_rest
+from .joint import Joint, least_sure, opened, polished, sized, with_rest, without_a_number
 from .judgement import KeptOut, Left, Searched, as_slow_noise, doubted_rest, reasons_against, standings_of, sticks_alone
 from .layout import describe_folds, repeats_not_said
 from .naming import beyond_simpler, strong
@@ -129,7 +129,7 @@ def diagnose(
             searched = _searched(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
             give_back_holes()
             asks = bool(searched.found) and not contradictions  # where nothing may be named, once is enough
-            again = setting_beside(searched.here, searched.joint.step.state, forbid) if asks else None
+            again = setting_beside(searched.here, searched.joint, forbid) if asks else None
             asked = (searched, reader, forbid, tolerance, alpha, generator)
             judged = _judged(*asked, contradictions)
             if not contradictions and (cannot_be := _impossible(judged)):
@@ -326,12 +326,14 @@ def _judged(
         shown = chance_beside(problem, joint.step, sober, here.whitening, forbid, generator) < REST_P
     law = any(strong(one) and against[one.name] for one in each)  # it moves, whatever it is
     sticks = (shown or (large and not named)) and not law
-    sticks = sticks and (sticks_alone(here, joint, tolerance) or sticks_alone(searched.here, by_speed, tolerance))
+    if sticks:
+        sticks = sticks_alone(here, joint, tolerance) or sticks_alone(searched.here, by_speed, tolerance)
+        sticks = sticks or (not named and sticks_alone(searched.here, as_moves(searched.here), tolerance))
     told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
     if (
         sticks
         and not named
-        and roughly_predictable(problem, told, whitening, tolerance, ~np.any(resting(problem), axis=2))
+        and roughly_predictable(problem, told, whitening, tolerance, ~np.any(resting(problem), axis=2)).any()
     ):
         shown, sticks = True, False  # what sticks, and something that moves and passed for noise
     rest, read = shown and not sticks, False
@@ -392,10 +394,13 @@ def _answered(
             gaining = gaining._replace(joint=as_weighed_otherwise(here, searched.here.problem, gaining.joint))
         by_speed = by_speed if len(first) == len(named) else together(searched.here, named)
         first, moving = named, as_weighed_in_motion(searched.here, by_speed) if named else by_speed
-        least = least_sure(moving)
-        if least is None:
+        if (least := least_sure(moving)) is not None:
+            why = f"its size is not surely above zero: {_told_size(moving, least, here)}"
+        elif (least := without_a_number(gaining.joint)) is not None:
+            why = "none of its ten numbers is surely there"
+        else:
             return here, gaining._replace(named=opened(named, gaining.joint, forbid)), by_speed, against
-        against[named[least].name] = f"its size is not surely above zero: {_told_size(moving, least, here)}"
+        against[named[least].name] = why
         named = [f for f in named if f is not named[least]]
         joint = together(here, named)
 
@@ -454,7 +459,8 @@ def _left(
         quiet = beyond_noise(problem, linear.residual, spectrum, whitening, generator, full, (rows, linear))[1]
     if not problem.layout.repeats and not found and not there:  # nor is it known how much of what is left is noise
         large = relative_rest(problem, joint.step.state, 0 * noise) > tolerance
-        there = bool((quiet & large).any()) or roughly_predictable(problem, joint.step, whitening, tolerance)
+        rough = roughly_predictable(problem, joint.step, whitening, tolerance)
+        there = bool((quiet & large).any() or rough.any())
     moves = np.moveaxis(~resting(problem), 2, 0).reshape(joint.step.rows.y.shape)
     beyond, alone = (
         beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)[0]

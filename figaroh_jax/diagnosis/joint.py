@@ -19,7 +19,7 @@ from .estimates import Fitted, amplitude_places, torque_slopes, with_amplitudes
 from .problem import Problem, family_of
 from .state import State, assembled, solved
 from .step import Step, stand
-from .thresholds import SIZE_REGION
+from .thresholds import NUMBER, SIZE_REGION
 
 if TYPE_CHECKING:
     from .search import Found
@@ -36,6 +36,7 @@ __all__ = [
     "with_misfit",
     "with_parts",
     "with_rest",
+    "without_a_number",
 ]
 
 KEPT = 1e-12  # of the diagonal: a ridge for numbers that no row shows
@@ -360,6 +361,21 @@ def least_sure(joint: Joint) -> int | None:
         shares.append(_beyond_zero(effect, joint.fitted, place, own, given) if own else np.inf)
     least = int(np.argmin(shares)) if shares else 0
     return least if shares and shares[least] <= 1 else None
+
+
+def without_a_number(joint: Joint) -> int | None:
+    """The first of the causes that is a body's, or a link's, of which none of the ten numbers is told from zero.
+
+    Together they may surely move what the link's torque depends on; but nobody could put in any of them, and a gain of
+    its joint follows as much.
+    """
+    for k, (effect, place) in enumerate(zip(joint.causes, joint.fitted.places, strict=True)):
+        if effect.inertial:
+            value = np.array([float(getattr(effect, name)) for name in fitted_fields(effect)])
+            variance = np.diag(joint.fitted.covariance)[list(place)]
+            if np.all(value**2 < NUMBER**2 * variance):
+                return k
+    return None
 
 
 def _amplitudes(effect: Effect) -> list[int]:

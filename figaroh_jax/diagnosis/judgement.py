@@ -15,10 +15,10 @@ from .floor import noise_rms, short, sober_spectrum
 from .gaining import Fall, beside_all, foretells
 from .joint import Joint
 from .naming import Standing, behind_joints, beside_rest, of_its_own, reason_against, standings, stands_alone
-from .rest import Significance, relative_rest
+from .rest import Significance, relative_rest, roughly_predictable
 from .search import Found, Search, chance_beside
 from .setting import Setting
-from .standstill import left_weighed, only_sticks
+from .standstill import left_weighed, only_sticks, resting
 from .step import stand
 from .thresholds import ALL_BUT, REST_P, SURE_DROP
 
@@ -126,6 +126,10 @@ def reasons_against(
         strict = strict or not sticks_alone(here, joint, tolerance)
     weighed = left_weighed(here.problem, joint.step.state, noise)  # rows at reversals say nothing of a law
     rests = beside_rest(each, [f.joints for f in found], strict, np.minimum(beyond, weighed), tolerance)
+    if not all(rests):  # what passed for noise at a cause's joints may be what it stands in for
+        at, moving = sorted({j for f in found for j in f.joints}), ~np.any(resting(here.problem), axis=2)
+        rough = roughly_predictable(here.problem, joint.step, here.whitening, tolerance, moving, at)
+        rests = [rest or bool(rough[list(f.joints)].any()) for rest, f in zip(rests, found, strict=True)]
     asked = (tolerance, kept_out.certain, searched.fading)
     against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
     return against | behind_joints([one for one, rest in zip(each, rests, strict=True) if rest], against)

@@ -217,29 +217,34 @@ def roughly_predictable(
     whitening: Float[np.ndarray, "F nv"],
     tolerance: float,
     moving: Bool[np.ndarray, "n M"] | None = None,
-) -> bool:
-    """Whether functions of the motion that no smooth one follows predict what is left, noise or not, at a joint where
-    that is more than tolerable, on data they were not fitted to: a ripple and a coupling that the catalogue lacks pass
+    at: Sequence[int] | None = None,
+) -> Bool[np.ndarray, " nv"]:
+    """Joints at which functions of the motion that no smooth one follows predict what is left, noise or not, on data
+    they were not fitted to, where that is more than tolerable: a ripple and a coupling that the catalogue lacks pass
     for noise without repeats; repeats know the noise.
 
     What is needed counts the joints and not the functions of one: on data left out, columns that say nothing cost more
     than the best of them gains by chance. Only rows that are `moving` are asked: a joint that sticks holds whatever the
-    others' motion brings, and one that breaks loose jerks them in a way that no filtered acceleration shows.
+    others' motion brings, and one that breaks loose jerks them in a way that no filtered acceleration shows. Only
+    joints `at` which it matters, or all.
     """
+    found = np.zeros(problem.model.nv, bool)
     if problem.layout.repeats:
-        return False
+        return found
     large = relative_rest(problem, step.state, np.zeros(problem.model.nv)) > tolerance
-    base, joints = ground(step.verdicts, step.state.prior, step.folded), np.flatnonzero(large)
-    each = [(int(joint), columns) for joint in joints for columns in rough_functions(step.state.motion, int(joint))]
-    for joint, columns in each:
-        rows = _rows_at(problem, step.state, columns, whitening, joint)
-        if moving is not None:
-            rows = rows * moving.reshape(-1)
-        grown = judge_grown(step.rows, base, (joint,), rows[:, None])
-        worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, grown))
-        if better.sum() < worse.sum() and t_value(worse, better) > t_needed(len(worse), T_REST, len(joints)):
-            return True
-    return False
+    joints = np.flatnonzero(large & (True if at is None else np.isin(np.arange(len(large)), list(at))))
+    base = ground(step.verdicts, step.state.prior, step.folded)
+    for joint in joints.tolist():
+        for columns in rough_functions(step.state.motion, joint):
+            rows = _rows_at(problem, step.state, columns, whitening, joint)
+            if moving is not None:
+                rows = rows * moving.reshape(-1)
+            grown = judge_grown(step.rows, base, (joint,), rows[:, None])
+            worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, grown))
+            if better.sum() < worse.sum() and t_value(worse, better) > t_needed(len(worse), T_REST, len(joints)):
+                found[joint] = True
+                break
+    return found
 
 
 def parts_of(

@@ -17,10 +17,11 @@ from ..simulators.contract import Backend
 from .flexible import friction_width
 from .floor import noise_floor, noise_rms, whitening_of
 from .holdout import fold_squares, residual_rms
+from .joint import Joint
 from .layout import checked_repeats, held_rows, layout
 from .problem import Problem
 from .state import State, baseline, stated_effects, with_width
-from .step import stand
+from .step import stand, with_causes
 from .thresholds import MOST_OF_RESIDUAL, OF_ANOTHER_WIDTH, PASSED_FOR_NOISE, WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_reversals
 
@@ -120,22 +121,31 @@ def setting_of(
     return Setting(problem.within_trust(), start, spectrum, whitening, white)
 
 
-def setting_beside(here: Setting, state: State, forbid: Sequence[str]) -> Setting | None:
+def setting_beside(here: Setting, joint: Joint, forbid: Sequence[str]) -> Setting | None:
     """The setting with new noise, weights and width of friction at the joints where a cause has passed for noise, or
     for such a width; None without any.
 
     What no group of the rich model follows, as a ripple of many periods, counts as noise until it is known (not where
     repeats tell the noise), weights by the baseline's residual hold every cause, and a wide reversal of the friction
-    makes up for some of it. The rows of such a joint then say too little of what it shares with the others: links and
-    laws of the whole robot follow these alone. The `state` holds all that was found; the other joints keep what they
-    have, so that what is told of them does not hang on a cause elsewhere.
+    makes up for some of it. What that reversal then lacks where the joint creeps may have been told as a law of the
+    speed: it goes where another width in its place leaves no more. The rows of such a joint say too little of what it
+    shares with the others: links and laws of the whole robot follow these alone.
+
+    `joint` is the fit of all that was found. The other joints keep what they have, so that what is told of them does
+    not hang on a cause elsewhere.
     """
-    problem, first = here.problem, stand(here.problem, here.start, here.whitening)
+    problem, first, state = here.problem, stand(here.problem, here.start, here.whitening), joint.step.state
     before, residual = residual_rms(problem, first.state), residual_rms(problem, state)
     most = residual < MOST_OF_RESIDUAL * before
     if not most.any():
         return None
-    turned, problem = _turned_elsewhere(problem, state, here.whitening, residual, most)
+    turned, problem = _turned_elsewhere(problem, state, here.whitening, OF_ANOTHER_WIDTH * residual, most)
+    if laws := [one for one in joint.causes if one.speed_law and most[int(one.at[0])] and not turned[int(one.at[0])]]:
+        others = [one for one in joint.causes if one not in laws]
+        at = np.isin(np.arange(len(most)), [int(one.at[0]) for one in laws])
+        bare = with_causes(problem, with_width(problem, here.start), others, here.whitening).state
+        instead, problem = _turned_elsewhere(problem, bare, here.whitening, residual, at)
+        turned, state = turned | instead, bare if instead.any() else state
     state = with_width(problem, state)
     spectrum, _ = noise_floor(problem, state, forbid)
     passed = most & (noise_rms(problem, spectrum) < PASSED_FOR_NOISE * noise_rms(problem, here.spectrum))
@@ -160,16 +170,16 @@ def _turned_elsewhere(
     problem: Problem,
     state: State,
     whitening: Float[np.ndarray, "F nv"],
-    residual: Float[np.ndarray, " nv"],
+    most: Float[np.ndarray, " nv"],
     joints: Bool[np.ndarray, " nv"],
 ) -> tuple[Bool[np.ndarray, " nv"], Problem]:
-    """The joints whose friction surely reverses over another width beside all that was found, and the problem with it.
+    """The joints whose friction reverses over another width beside what the state holds, and the problem with it.
 
-    `residual` is what the state leaves (RMS, N m or N).
+    `most` is what the state may then leave (RMS, N m or N).
     """
     other = friction_width(problem, state, whitening, np.flatnonzero(joints).tolist())
     if other is problem:
         return np.zeros_like(joints), problem
     now = residual_rms(other, stand(other, with_width(other, state), whitening).state)
-    turned = (other.width != problem.width) & (now < OF_ANOTHER_WIDTH * residual)
+    turned = (other.width != problem.width) & (now < most)
     return turned, problem.with_width(np.where(turned, other.width, problem.width)) if turned.any() else problem
