@@ -298,8 +298,7 @@ def _judged(
     model contradict each other, or the links of the answer cannot be, that is `unknown`, whatever has been found: a
     cause stands for what is wrong with them as well as for itself.
     """
-    before, here, _, found, joint, left, *_ = searched
-    problem, whitening = here.problem, here.whitening
+    before, here, _, found, _, left, *_ = searched
     each = standings_of(searched)
     kept_out = KeptOut(searched, {one.name: one.gain for one in each})
     doubted = doubted_rest(searched, forbid, generator)
@@ -311,52 +310,81 @@ def _judged(
         against |= {f.name: f"noise as slow as the motion scores as much by chance (p = {chance:.2g})" for f in named}
         named = []
     settings = [here] if before.problem is here.problem else [here, before]
-    asked_more = [one.name for one in each if one.whole or not one.beside_rest] if problem.held.any() else []
+    asked_more = [one.name for one in each if one.whole or not one.beside_rest] if here.problem.held.any() else []
     must_keep = {name: kept_out.claims[name] for name in asked_more}
     here, gaining, by_speed, reasons = _answered(searched, settings, named, kept_out.borne_out, forbid, must_keep)
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= reasons
     nearest = [Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name]]
-    noise = noise_rms(problem, here.spectrum)
-    relative = relative_rest(problem, joint.step.state, noise)
+    relative = relative_rest(problem, joint.step.state, noise_rms(problem, here.spectrum))
     large = float(relative.max()) > tolerance
     shown = left.rest.there or ((bool(nearest) or doubted) and large)
     if shown and not named and not left.rest.there and not doubted and short(problem, joint.step.state):
         sober = sober_spectrum(problem, joint.step.state, forbid)
         shown = chance_beside(problem, joint.step, sober, here.whitening, forbid, generator) < REST_P
-    law = any(strong(one) and against[one.name] for one in each)  # it moves, whatever it is
-    sticks = (shown or (large and not named)) and not law
-    if sticks:
-        sticks = sticks_alone(here, joint, tolerance) or sticks_alone(searched.here, by_speed, tolerance)
-        sticks = sticks or (not named and sticks_alone(searched.here, as_moves(searched.here), tolerance))
-    told = joint.step if here.whitening is whitening else stand(problem, joint.step.state, whitening)
-    if (
-        sticks
-        and not named
-        and roughly_predictable(problem, told, whitening, tolerance, ~np.any(resting(problem), axis=2)).any()
-    ):
-        shown, sticks = True, False  # what sticks, and something that moves and passed for noise
-    rest, read = shown and not sticks, False
-    if rest and not named and left.line[0] >= LINE_P:  # a line is none of what reading a motion leaves
-        errors = reader.errors(problem, joint.step.state, generator)
-        read = only_read(problem, joint.step.state, noise, relative, tolerance, errors, reader.rounding)
-        rest = not read
-    text = (left.rest.text or ("" if relative.any() else _LESS_THAN_NOISE)) if rest else ""
-    if contradictions:
-        rest, sticks, read = True, False, False
+    same = here.whitening is searched.here.whitening
+    told = joint.step if same else stand(problem, joint.step.state, searched.here.whitening)
+    stays = _Stays(True, False, False)
+    if not contradictions:
+        law = any(strong(one) and against[one.name] for one in each)  # it moves, whatever it is
+        stays = _as_what(searched, here, gaining, by_speed, told, shown, law, reader, tolerance, generator)
+    rest, sticks, read = stays
+    text = (left.rest.text or ("" if relative.any() else _LESS_THAN_NOISE)) if rest and shown else ""
     if rest and named:
         gaining = gaining._replace(joint=_beside_rest(here, named, joint))
-    parts = parts_of(problem, told, whitening, left.line, [s.name for s in reader.signals])
+    parts = parts_of(problem, told, searched.here.whitening, left.line, [s.name for s in reader.signals])
     nearest.sort(key=lambda one: -one.share)
     quiet = not rest and not named and (large or searched.search.p_value < alpha)
     why = tolerated(float(relative.max()), tolerance, sticks, read) if quiet or read else ""
-    unsure, more = "", ""
+    unsure, more = "", _SETTLE_FIRST if contradictions else ""
     if quiet and not why:  # asked of the rows that the second opinions were asked of
         unsure, more = undecided(searched.here.problem, searched.joint.step.state)
-    if contradictions:
-        more = _SETTLE_FIRST
     told_rest = Rest(relative, parts, tuple(nearest), text, why, unsure, tuple(contradictions))
     return _Judged(verdict(bool(named), rest), gaining, told_rest, sticks, here, more)
+
+
+class _Stays(NamedTuple):
+    """As what it counts that the answer does not explain."""
+
+    rest: bool  # as something that the catalogue does not name
+    sticks: bool  # as dry friction of joints at rest
+    read: bool  # as what sensors make of a model that is right
+
+
+def _as_what(
+    searched: Searched,
+    here: Setting,
+    gaining: Gaining,
+    by_speed: Joint,
+    told: Step,
+    shown: bool,
+    law: bool,
+    reader: Reader,
+    tolerance: float,
+    generator: np.random.Generator,
+) -> _Stays:
+    """As what it counts that an answer leaves: `shown` or not, beside a `law` that moves and has no name or none.
+
+    `told` is the answer in rows as white as those of the search, `by_speed` its causes with the weights of the search.
+    """
+    named, joint, problem = gaining.named, gaining.joint, here.problem
+    noise = noise_rms(problem, here.spectrum)
+    relative = relative_rest(problem, joint.step.state, noise)
+    sticks = (shown or (float(relative.max()) > tolerance and not named)) and not law
+    if sticks:
+        sticks = sticks_alone(here, joint, tolerance) or sticks_alone(searched.here, by_speed, tolerance)
+        sticks = sticks or (not named and sticks_alone(searched.here, as_moves(searched.here), tolerance))
+    if sticks and not named:
+        moving = ~np.any(resting(problem), axis=2)
+        if roughly_predictable(problem, told, searched.here.whitening, tolerance, moving).any():
+            return _Stays(True, False, False)  # what sticks, and something that moves and passed for noise
+    if not shown or sticks:
+        return _Stays(False, sticks, False)
+    read = False
+    if not named and searched.left.line[0] >= LINE_P:  # a line is none of what reading a motion leaves
+        errors = reader.errors(problem, joint.step.state, generator)
+        read = only_read(problem, joint.step.state, noise, relative, tolerance, errors, reader.rounding)
+    return _Stays(not read, False, read)
 
 
 def _impossible(judged: _Judged) -> tuple[str, ...]:
