@@ -345,12 +345,11 @@ def _found(
     drop = step.verdicts.cost - best.verdicts.cost
     open_to = ambiguous(step, best, alike, screened)
     wins = shares_of_wins(np.stack([c.verdicts.blocks for c in [best, *alike]]), generator)
-    # laws that hold this one, and need not: where they win, it has won
-    outer = np.array([best.name.effect in type(c.effect).contains and c.name.at == best.name.at for c in alike], bool)
+    # what holds this one, and need not: where it wins, this one has won
+    outer = np.array([_within_law(best, c) or _takes_most(step, best, c) for c in alike], bool)
     own = float(wins[0] + wins[1:][outer].sum())
     # where the links are not well known, those that they can stand for are no names
     apart = np.array([problem.trust <= c.effect.needs_trust and physical_sign(c.effect) for c in alike], bool)
-    apart &= np.array([not _takes_most(step, best, c) for c in alike], bool)
     return Found(
         name=best.name,
         effect=best.effect,
@@ -365,6 +364,11 @@ def _found(
         instead=tuple(Rival(c.name, c.effect, c.joints) for c in alike if c.name in open_to),
         outdone=own < OUTDONE * (own + wins[1:][apart & ~outer].sum()),
     )
+
+
+def _within_law(best: Contender, rival: Contender) -> bool:
+    """Whether the rival is a law at the same place that holds this one."""
+    return best.name.effect in type(rival.effect).contains and rival.name.at == best.name.at
 
 
 def _takes_most(step: Step, best: Contender, rival: Contender) -> bool:
