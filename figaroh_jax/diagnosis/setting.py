@@ -141,7 +141,7 @@ def setting_beside(here: Setting, joint: Joint, forbid: Sequence[str]) -> Settin
         return None
     turned, problem = _turned_elsewhere(problem, state, here.whitening, OF_ANOTHER_WIDTH * residual, most)
     if laws := [one for one in joint.causes if one.speed_law and most[int(one.at[0])] and not turned[int(one.at[0])]]:
-        others = [one for one in joint.causes if one not in laws]
+        others = [one for one in joint.causes if not any(one is law for law in laws)]
         at = np.isin(np.arange(len(most)), [int(one.at[0]) for one in laws])
         bare = with_causes(problem, with_width(problem, here.start), others, here.whitening).state
         instead, problem = _turned_elsewhere(problem, bare, here.whitening, residual, at)
