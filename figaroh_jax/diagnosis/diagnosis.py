@@ -426,11 +426,22 @@ def _answered(
             why = f"its size is not surely above zero: {_told_size(moving, least, here)}"
         elif (least := without_a_number(gaining.joint)) is not None:
             why = "none of its ten numbers is surely there"
+        elif (least := _as_links(named, gaining.joint)) is not None:
+            why = (
+                "beside it the links would move further than believed, which no cause explains: it may be part of that"
+            )
         else:
             return here, gaining._replace(named=opened(named, gaining.joint, forbid)), by_speed, against
         against[named[least].name] = why
         named = [f for f in named if f is not named[least]]
         joint = together(here, named)
+
+
+def _as_links(named: Sequence[Found], joint: Joint) -> int | None:
+    """The first of the causes that links other than believed may look like, where the fit would have links be so."""
+    if joint.step.loose is None:
+        return None
+    return next((k for k, f in enumerate(named) if f.effect.like_links), None)
 
 
 def _beside_rest(here: Setting, named: Sequence[Found], joint: Joint) -> Joint:

@@ -21,6 +21,7 @@ class GravityTilt(Effect):
     """A base that is not level: gravity in the base frame has a horizontal part."""
 
     name, title, acts_on = "gravity_tilt", "base tilt", "robot"
+    like_links = True
     equation = "tau(gravity + (x, y, 0)) - tau(gravity)"
     separated_by = "a full turn of the first joint with the arm stretched, or a level on the base"
     in_rollouts = InRollouts(
@@ -70,6 +71,7 @@ class ExternalWrench(PointEffect):
     """A constant force on the last link: a cable, a hose, somebody who pulls."""
 
     name, title = "external_wrench", "constant external force"
+    like_links = True
     equation = "-J(q)' (force_x, force_y, force_z) at the point (x, y, z) of the link"
     separated_by = "the same motion with {at} free, or with the base turned"
     resembles = ("gravity_tilt", "payload")  # six numbers that follow any constant load of a few postures

@@ -56,6 +56,7 @@ class TorqueGain(JointEffect):
     """A wrong torque constant or gear ratio: the reading is off by a factor."""
 
     name, title = "torque_gain", "torque gain error"
+    like_links = True
     levels = ("torque", "pose")  # in rollouts it acts where a model has it, but is not looked for
     follows_torque = follows_total = True
     equation = "gain tau_hat"
@@ -191,6 +192,7 @@ class EncoderOffset(JointEffect):
     """A zero of the encoder that is not the model's."""
 
     name, title = "encoder_offset", "encoder zero offset"
+    like_links = True
     levels = ("torque", "rollout")  # to a calibration it is a `joint_offset`
     in_rollouts = InRollouts((("offset", "reading"),), lambda scale: ((0.0,),), constant=True)
     equation = "q_measured = q + offset"
@@ -207,6 +209,7 @@ class EncoderScale(JointEffect):
     """An encoder that counts too much or too little a turn, or a gear ratio that is not the model's."""
 
     name, title = "encoder_scale", "encoder scale error"
+    like_links = True
     correction = -1.0
     equation = "q_measured = q + scale q"
     separated_by = "motion of {at} over more than half a turn, or kinematic calibration"

@@ -34,6 +34,7 @@ class RotorInertia(JointEffect):
     """Inertia of the motor and gears, seen through the gear ratio (armature)."""
 
     name, title = "rotor_inertia", "rotor inertia"
+    like_links = True
     reverses = False
     equation = "inertia a"
     separated_by = "fast motion of {at} in several postures of the joints beyond it"
@@ -123,6 +124,7 @@ class JointSpring(JointEffect):
     """A spring across the joint: a balancer, a cable, a hose."""
 
     name, title = "joint_spring", "joint spring"
+    like_links = True
     contains = ("torque_offset",)
     of_position = True
     reverses = False
