@@ -516,7 +516,7 @@ def _left(
 
 def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:
     here, seen = judged.here, stand(searched.problem, searched.start, searched.whitening)
-    named, joint, order, gains, holdout, _ = judged.causes
+    named, joint, order, gains, holdout, *_ = judged.causes
     problem, model, last = here.problem, here.problem.model, joint.step
     first = stand(problem, here.start, here.whitening)
     found = [named[k] for k in order]
@@ -550,13 +550,21 @@ def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judge
         baseline=fitted_model(problem, first.state, []),
         model=fitted_model(problem, last.state, joint.causes),
         rest=judged.rest,
-        notes=(*_notes(signals, here, last), *([_AT_REST] if judged.sticks else [])),
+        notes=(
+            *_notes(signals, here, last),
+            *([_LINKS_HELD] if judged.causes.links_held else []),
+            *([_AT_REST] if judged.sticks else []),
+        ),
         prismatic=prismatic(model),
     )
 
 
 _SETTLE_FIRST = "none before what looks wrong is settled: put it right in the task or the recording, and diagnose again"
 _LESS_THAN_NOISE = "less is left than the noise is estimated to be, so part of that estimate is an error of the model"
+_LINKS_HELD = (
+    "the links of the extended model are those of the model without causes: fitted anew beside them, they would predict"
+    " what was kept out worse by chance"
+)
 _AT_REST = (
     "at rest the torque differs from the model, as dry friction allows: there it can take any value up to its limit,"
     " which no law of velocity predicts; where the joints move, the residual is within the tolerance"

@@ -14,7 +14,16 @@ from .answer_fit import together
 from .floor import noise_rms, short, sober_spectrum
 from .gaining import Fall, beside_all, foretells
 from .joint import Joint
-from .naming import Standing, behind_joints, beside_rest, of_its_own, reason_against, standings, stands_alone
+from .naming import (
+    Standing,
+    behind_joints,
+    beside_rest,
+    of_its_own,
+    reason_against,
+    standings,
+    stands_alone,
+    stands_out,
+)
 from .rest import Significance, relative_rest, roughly_predictable
 from .search import Found, Search, chance_beside
 from .setting import Setting
@@ -95,7 +104,7 @@ def standings_of(searched: Searched) -> list[Standing]:
             complete=bool(left.more[list(f.joints)].max() <= ALL_BUT * (f.cost[0] - f.cost[1])),
             leaves=of_its_own(left.beyond, f.joints, one.taken),
             alone=stands_alone(left.misfit, f.joints),
-            followed=of_its_own(left.followed, f.joints, one.taken),
+            followed=of_its_own(left.followed, f.joints, one.taken) * stands_out(left.followed, f.joints),
             unmoved=stands_alone(left.moved, f.joints),
         )
         for one, f in zip(each, found, strict=True)

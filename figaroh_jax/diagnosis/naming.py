@@ -48,6 +48,7 @@ from .thresholds import (
     MODULATION_ROBOT,
     OWN_SHARE,
     SHARE_NAMED,
+    STANDS_OUT,
     T_NAMED,
     WEIGHTLESS,
 )
@@ -62,6 +63,7 @@ __all__ = [
     "reason_against",
     "standings",
     "stands_alone",
+    "stands_out",
     "strong",
 ]
 
@@ -243,6 +245,13 @@ def stands_alone(misfit: Bool[np.ndarray, " nv"], joints: Sequence[int]) -> bool
     """
     acts = np.isin(np.arange(len(misfit)), list(joints))
     return bool(np.mean(misfit if acts.all() else misfit[~acts]) < 0.5)
+
+
+def stands_out(squares: Float[np.ndarray, " nv"], joints: Sequence[int]) -> bool:
+    """Whether some of a cause's `joints` have surely more of what is left than most other joints have: what all of them
+    have is no trace of a law that acts at these. Always, where it acts on all."""
+    acts = np.isin(np.arange(len(squares)), list(joints))
+    return bool(acts.all() or squares[acts].max() > STANDS_OUT * np.median(squares[~acts]))
 
 
 def of_its_own(beyond: Float[np.ndarray, " nv"], joints: Sequence[int], taken: float) -> float:

@@ -58,6 +58,7 @@ MODULATION_HELD_OUT = 0.2  # the same on data that were not fitted
 BY_CHANCE = 0.02  # p-value of what data kept out of the fit want of a cause: above, it is chance
 BY_CHANCE_BESIDE = 0.01  # the same beside causes without a name
 BY_CHANCE_UNSHOWN = 0.001  # the same where slices of the recordings that are fitted do not surely show it
+HELD = (10.0, 100.0, 1e4, 1e8)  # times the stated precision of the links, with which they stay near where they are
 RISES = 0.1  # p-value of a rise of the error of all rows kept out: below, the robot is predicted worse
 KEPT_OF_CLAIM = 1 / 3  # of what a cause takes in slices: what must be left of it in such a fall
 STANDS = SPEED_EDGES[1]  # of a joint's top speed: below, it stands, and its rows say nothing of a law of the motion
@@ -65,6 +66,7 @@ BUYS = 0.01  # of the squares that a law of the whole robot removes: what it may
 LAW_LEAVES = 0.05  # of the squares that a cause removes: what may surely stay at its joints where no other has a misfit
 ALL_BUT = 0.1  # of the squares that a cause removes: what smooth functions may still find where it is all there is, and
 # what an amplitude that varies may surely gain
+STANDS_OUT = 2.0  # times what most other joints have: squares at a cause's joints that count as a trace of its own
 MARGIN = 4.0  # times what is needed, of t, gain and modulation together (each of them as much at the most)
 SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
 WEIGHTLESS = 2.0  # standard deviations below zero of what a link weighs with its cause: above, the cause is none
