@@ -14,7 +14,7 @@ from .screening import Screen
 from .step import Step
 from .thresholds import GAIN, OVERLAP_SAME, SIZE_REGION, T_ALIKE, T_APART, T_BETTER
 
-__all__ = ["ambiguous", "exists", "gains", "passes", "physical_sign", "rivals", "simpler"]
+__all__ = ["ambiguous", "exists", "gains", "holds", "passes", "physical_sign", "rivals", "simpler"]
 
 
 def exists(problem: Problem, effect: Effect) -> bool:
@@ -79,8 +79,12 @@ def passes(step: Step, contenders: list[Contender], one: Contender) -> bool:
 
 
 def _recurs(step: Step, contenders: list[Contender], one: Contender) -> bool:
-    """Whether the cause is among the best three of its rivals in two thirds of the folds, ranked without the fold."""
-    field = np.stack([c.verdicts.without for c in rivals(step, contenders, one)] or [one.verdicts.without])
+    """Whether the cause is among the best three of its rivals in two thirds of the folds, ranked without the fold.
+
+    A law that holds it at the same place is no rival: where that is better, so may this one be.
+    """
+    others = [c for c in rivals(step, contenders, one) if not holds(c, one)]
+    field = np.stack([c.verdicts.without for c in others] or [one.verdicts.without])
     ranks = (field < one.verdicts.without).sum(0)
     return float(np.mean(ranks < 3)) >= 2 / 3
 
@@ -91,6 +95,11 @@ def simpler(step: Step, contenders: list[Contender], one: Contender) -> list[Con
     inside = [c for c in contenders if c.name.effect in kind.contains and c.name.at == one.name.at]
     like = [c for c in rivals(step, contenders, one) if c.name.effect in kind.resembles and physical_sign(c.effect)]
     return [c for c in (*inside, *like) if _member(step, one, c)]
+
+
+def holds(law: Contender, one: Contender) -> bool:
+    """Whether a law holds another one at the same place."""
+    return one.name.effect in type(law.effect).contains and law.name.at == one.name.at
 
 
 def rivals(step: Step, contenders: list[Contender], one: Contender) -> list[Contender]:
@@ -108,7 +117,7 @@ def _member(step: Step, best: Contender, other: Contender) -> bool:
     offset) is enough where the other's further numbers explain no more than noise.
     """
     worse = t_value(other.verdicts.blocks, best.verdicts.blocks)
-    if other.name.effect in type(best.effect).contains and other.name.at == best.name.at and not _needed(best, other):
+    if holds(best, other) and not _needed(best, other):
         return worse < T_APART
     no_more = len(other.effect.parameters()) <= len(best.effect.parameters())
     if no_more and other.verdicts.cost <= best.verdicts.cost:

@@ -21,7 +21,7 @@ from .design import kind
 from .estimates import amplitude_places, with_amplitudes
 from .evidence import block_scores
 from .flexible import friction_width
-from .gates import ambiguous, exists, gains, passes, physical_sign, rivals, simpler
+from .gates import ambiguous, exists, gains, holds, passes, physical_sign, rivals, simpler
 from .joint import polished
 from .problem import Problem
 from .screening import DRAWS, Null, Screen, Shown, catalogue, family_p, place_p, screen
@@ -346,7 +346,7 @@ def _found(
     open_to = ambiguous(step, best, alike, screened)
     wins = shares_of_wins(np.stack([c.verdicts.blocks for c in [best, *alike]]), generator)
     # what holds this one, and need not: where it wins, this one has won
-    outer = np.array([_within_law(best, c) or _takes_most(step, best, c) for c in alike], bool)
+    outer = np.array([holds(c, best) or _takes_most(step, best, c) for c in alike], bool)
     own = float(wins[0] + wins[1:][outer].sum())
     # where the links are not well known, those that they can stand for are no names
     apart = np.array([problem.trust <= c.effect.needs_trust and physical_sign(c.effect) for c in alike], bool)
@@ -364,11 +364,6 @@ def _found(
         instead=tuple(Rival(c.name, c.effect, c.joints) for c in alike if c.name in open_to),
         outdone=own < OUTDONE * (own + wins[1:][apart & ~outer].sum()),
     )
-
-
-def _within_law(best: Contender, rival: Contender) -> bool:
-    """Whether the rival is a law at the same place that holds this one."""
-    return best.name.effect in type(rival.effect).contains and rival.name.at == best.name.at
 
 
 def _takes_most(step: Step, best: Contender, rival: Contender) -> bool:
