@@ -248,7 +248,7 @@ def stood_by(
     monkeypatch.setattr(gaining, "_by_gain", by_gain)
     monkeypatch.setattr(gaining, "polished", lambda problem, start, causes, whitening: joint(causes))
     found: Any = [SimpleNamespace(name=c, effect=c, joints=(0,)) for c in causes]
-    problem: Any = SimpleNamespace(model=SimpleNamespace(joint_names=("one",)))
+    problem: Any = SimpleNamespace(model=SimpleNamespace(joint_names=("one",)), bounded=True)  # no other links
     start, whitening, sure = cast(Any, None), np.zeros((1, 1)), cast(Any, borne_out.__contains__)
     return without_losses(problem, start, whitening, found, joint(causes), strict, sure, cast(Any, claims or {}))
 
