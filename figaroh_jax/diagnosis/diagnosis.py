@@ -562,8 +562,8 @@ def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judge
 _SETTLE_FIRST = "none before what looks wrong is settled: put it right in the task or the recording, and diagnose again"
 _LESS_THAN_NOISE = "less is left than the noise is estimated to be, so part of that estimate is an error of the model"
 _LINKS_HELD = (
-    "the links of the extended model are those of the model without causes: fitted anew beside them, they would predict"
-    " what was kept out worse by chance"
+    "the links of the extended model are held near those of the model without causes: free beside them, they would"
+    " predict what was kept out worse by chance"
 )
 _AT_REST = (
     "at rest the torque differs from the model, as dry friction allows: there it can take any value up to its limit,"

@@ -46,7 +46,7 @@ class Gaining(NamedTuple):
     gains: list[Gain]  # of each, in that order
     holdout: Gain  # of all together
     worse: list[Name]  # those that did not
-    links_held: bool = False  # whether the links stay where the fit without causes has them
+    links_held: bool = False  # whether the links are held near those of the fit without causes
 
 
 class Fall(NamedTuple):
@@ -132,9 +132,9 @@ def without_losses(
     Each is judged as it comes in: by what it gains alone, or else after all the others, for some show only beside
     another, or beside what has no name (`borne_out`). All together never raise the error of the robot on all rows held
     out, be it by chance: what is handed over predicts no worse than the model without causes. Where links that move
-    with them do, the links are held (`_beside_links`). `claims` are the shares
-    that causes take in slices of which recordings kept out must surely show a part: any rest looks like these, or they
-    act on the whole robot, alike in every motion.
+    with them do, the links are held (`_beside_links`). `claims` are the shares that causes take in slices of which
+    recordings kept out must surely show a part: any rest looks like these, or they act on the whole robot, alike in
+    every motion.
     """
     claims = claims or {}
     worse: list[Name] = []
