@@ -86,6 +86,14 @@ def test_what_a_fit_had_lost_is_named_and_sized(effect: str, seed: int, scale: f
 
 
 @needs_robots
+def test_friction_that_a_law_turns_down_is_no_friction():
+    """A drive at its limit, which the catalogue lacked, was a power law that lost a fifth of joint 6's friction again
+    towards its top speed."""
+    hidden = make_case([("torque_saturation", 0.15)], "tx40", 1, 4, 0.5, 2849299173, colour="white", encoder_step=1e-5)
+    assert diagnosed(hidden, ["torque_saturation"]).verdict == "unknown"
+
+
+@needs_robots
 def test_presliding_is_not_what_samples_make_of_friction():
     """Its wide reversal was read as that of dry friction between two samples: `nothing`, at 11 % of the torque."""
     hidden = make_case([("presliding", 0.15)], "tx40", 1, 4, 0.5, 1232811719, colour="ar20", encoder_step=1e-4)

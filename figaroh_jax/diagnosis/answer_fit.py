@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .gaining import kept_squares, surely_less
-from .holdout import part_error, residual_rms
+from .holdout import part_error, residual_rms, weighted_rms
 from .joint import Joint, polished, with_misfit, with_parts
 from .problem import Problem
 from .search import Found
@@ -62,7 +62,7 @@ def as_predicts_best(
     assert best is not None and first is not None
     error, chosen, joint = best
     if not chosen.white:
-        residual = residual_rms(chosen.problem, joint.step.state)
+        residual = weighted_rms(chosen.problem, joint.step.state)
         level = np.broadcast_to(1 / np.maximum(residual, 1e-12 * residual.max()), chosen.whitening.shape)
         white = chosen._replace(whitening=level, white=True)
         step = stand(white.problem, joint.step.state, level)  # the laws' shapes as they are
@@ -102,7 +102,7 @@ def as_weighed_otherwise(here: Setting, by_speed: Problem, joint: Joint) -> Join
     """The answer's fit with what its intervals owe to its parts, to weights of slow rows and to the spectrum."""
     problem, judged = here.problem, np.asarray(here.problem.records.judged)
     slow = [judged, np.asarray(by_speed.records.weight), judged * (relative_speed(problem) >= STANDSTILL)]
-    white = np.ones_like(here.whitening) / np.maximum(residual_rms(problem, joint.step.state), 1e-300)
+    white = np.ones_like(here.whitening) / np.maximum(weighted_rms(problem, joint.step.state), 1e-300)
     own = np.asarray(problem.records.weight)
     weights = [(w, here.whitening) for w in slow if not np.array_equal(w, own)]
     joint = with_parts(problem, joint, here.whitening)
@@ -117,7 +117,7 @@ def as_weighed_in_motion(here: Setting, by_speed: Joint) -> Joint:
     holds, gives part of a law of the motion away, and which fit predicts best changes from one recording to the next.
     """
     problem = here.problem
-    white = np.ones_like(here.whitening) / np.maximum(residual_rms(problem, by_speed.step.state), 1e-300)
+    white = np.ones_like(here.whitening) / np.maximum(weighted_rms(problem, by_speed.step.state), 1e-300)
     own = np.asarray(problem.records.weight)
     moving = own * (relative_speed(problem) >= STANDSTILL)
     joint = with_parts(problem, by_speed, here.whitening)

@@ -31,6 +31,7 @@ __all__ = [
     "predicted",
     "residual_rms",
     "traces",
+    "weighted_rms",
     "weighted_squares",
     "whitened_wanted",
 ]
@@ -182,6 +183,13 @@ def residual_rms(problem: Problem, state: State) -> Float[np.ndarray, " nv"]:
     weight = np.asarray(problem.records.judged)
     squares = ((problem.torque - predicted(problem, state)) ** 2 * weight).sum((0, 1))
     return np.sqrt(squares / np.maximum(weight.sum((0, 1)), 1))
+
+
+def weighted_rms(problem: Problem, state: State) -> Float[np.ndarray, " nv"]:
+    """As `residual_rms`, of the rows as they are weighted: what a row of full weight is left with."""
+    records = problem.records
+    error = np.asarray(records.weight) * (problem.torque - predicted(problem, state))
+    return np.sqrt((error**2).sum((0, 1)) / np.maximum(records.fitted.sum((0, 1)), 1))
 
 
 def traces(

@@ -50,6 +50,7 @@ from .thresholds import (
     SHARE_NAMED,
     STANDS_OUT,
     T_NAMED,
+    TURNED_DOWN,
     WEIGHTLESS,
 )
 
@@ -309,6 +310,7 @@ def standings(
                 static=effect.of_position or (whole and kind(effect) == "columns"),
                 physical=physical_sign(effect)
                 and not (coupled and _turns_against_itself(effect, joint.fitted, at))
+                and not (effect.bends and _turned_down(full.state, effect, torque))
                 and not (effect.acts_on == "link" and _weighs_less_than_nothing(problem, effect, joint.fitted, at)),
                 beside_rest=effect.beside_rest,
                 gain=1 - float(better.sum() / max(worse.sum(), 1e-300)),
@@ -340,6 +342,18 @@ def _weighs_less_than_nothing(problem: Problem, effect: Effect, fitted: Fitted, 
     change = float(getattr(effect, "mass", 0.0))
     whole = float(np.asarray(problem.model.inertia)[int(effect.at[0]), 0]) + change
     return whole < 0 and -whole * abs(_deviations(effect, fitted, place)["mass"]) > WEIGHTLESS * abs(change)
+
+
+def _turned_down(state: State, effect: Effect, torque: Float[np.ndarray, "nN nv"]) -> bool:
+    """Whether viscous friction, bent by a law's `torque`, falls towards the joint's top speed: what no lubricant does,
+    and a drive at its limit looks like."""
+    joint = int(effect.at[0])
+    velocity, level = np.asarray(state.motion.velocity)[:, joint], torque[:, joint].copy()
+    for term, share in zip(state.terms, state.shares(state.theta), strict=True):
+        if term.name == "viscous_friction":
+            level += share[:, joint]
+    level *= np.sign(velocity)
+    return bool(level[np.argmax(np.abs(velocity))] < (1 - TURNED_DOWN) * level.max())
 
 
 class _Grown(NamedTuple):
@@ -403,7 +417,8 @@ def _shares_of_torque(problem: Problem, state: State, torque: np.ndarray, effect
     """RMS torque of a cause over that of the joint, where it is largest: over all rows, and while it acts.
 
     The latter is the RMS in which each row counts as much as the cause's square there: a play that is crossed for some
-    hundredths of a second is nothing at all other times.
+    hundredths of a second is nothing at all other times. Of a drive at its limit all samples count too: the ends of a
+    recording have no rows, and may be where it is reached most.
     """
     response = state.response(problem.records.omega)
     if kind(effect) == "response":
@@ -414,7 +429,20 @@ def _shares_of_torque(problem: Problem, state: State, torque: np.ndarray, effect
     (size, fourth), whole = ((rows**k).sum((0, 1)) for k in (2, 4)), ((problem.torque * fitted) ** 2).sum((0, 1))
     own = fitted.sum((0, 1)) * fourth / np.maximum(size, 1e-300)
     shares = [float(np.sqrt((x / np.maximum(whole, 1e-12 * whole.max())).max())) for x in (size, own)]
+    if effect.has("through"):
+        shares[0] = max(shares[0], _share_of_samples(problem, torque, int(effect.at[0])))
     return shares[0], shares[1]
+
+
+def _share_of_samples(problem: Problem, torque: Float[np.ndarray, "nN nv"], joint: int) -> float:
+    """RMS of a cause over that of the torque of a joint, at all samples of the recordings that are fitted."""
+    records, squares = problem.records, np.zeros(2)
+    own = torque.reshape(np.shape(records.torque))
+    for at in records.spans:
+        if records.judged[at.slot, at.row : at.row + at.rows, joint].any():
+            here = at.slot, slice(at.sample, at.sample + at.samples), joint
+            squares += [(one[here] ** 2).sum() for one in (own, np.asarray(records.torque))]
+    return float(np.sqrt(squares[0] / max(squares[1], 1e-300)))
 
 
 def _modulation(

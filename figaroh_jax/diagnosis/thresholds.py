@@ -70,6 +70,7 @@ STANDS_OUT = 2.0  # times what most other joints have: squares at a cause's join
 MARGIN = 4.0  # times what is needed, of t, gain and modulation together (each of them as much at the most)
 SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
 WEIGHTLESS = 2.0  # standard deviations below zero of what a link weighs with its cause: above, the cause is none
+TURNED_DOWN = 0.05  # of its largest: what friction that a law bends may have lost at the joint's top speed
 COUPLED = 2.0  # standard deviations of a part of a coupling (inertia, damping, friction), of which two must be there
 NUMBER = 3.0  # standard deviations of a link's or a body's ten numbers, of which one must be there
 MASS = 3.0  # standard deviations of a body's mass: below, what moves is the link that carries it

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from ..estimation.rows import Rows
 from ..recordings.stacked import Records, filter_rows
 from .flexible import smooth_functions
-from .holdout import fold_error, residual_rms
+from .holdout import fold_error, weighted_rms
 from .problem import Problem
 from .state import State, whitened
 from .step import stand
@@ -96,18 +96,19 @@ def white_where_better(
     """What the rows pass: the `coloured` whitening, or each joint's residual RMS alone where that predicts better.
 
     The spectrum of the noise says whether there is a rest. Where the model errs by more than the noise, weights by the
-    noise alone follow what the model does worst; judged by the error in N m on the folds.
+    noise alone follow what the model does worst; judged by the error in N m on the folds. The RMS is that of the rows as
+    they are weighted: slow ones, which count less, must not make their joint's fast ones count less too.
     """
     step = stand(problem, state, coloured)
     error, residual = (
         fold_error(problem, step.state, step.verdicts.folds, problem.layout.fold),
-        residual_rms(problem, step.state),
+        weighted_rms(problem, step.state),
     )
     white = np.broadcast_to(1 / np.maximum(residual, 1e-12 * residual.max()), coloured.shape)
     other = stand(problem, state, white)
     if fold_error(problem, other.state, other.verdicts.folds, problem.layout.fold) > (1 - WHITE_GAIN) * error:
         return coloured, False
-    residual = residual_rms(problem, other.state)
+    residual = weighted_rms(problem, other.state)
     return np.broadcast_to(1 / np.maximum(residual, 1e-12 * residual.max()), coloured.shape), True
 
 

@@ -145,7 +145,7 @@ class PowerLawFriction(JointEffect):
 
     name, title = "power_law_friction", "power-law friction"
     levels = ("torque", "pose")  # in rollouts it acts where a model has it, but is not looked for
-    rubs = speed_law = True
+    rubs = speed_law = bends = True
     equation = "strength |v|^exponent s(v)"
     separated_by = "constant-speed sweeps of {at} from 0.05 rad/s to its maximum speed"
     strength: Scalar = amplitude("N m (s/rad)^exponent")
