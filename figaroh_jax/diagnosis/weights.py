@@ -96,7 +96,7 @@ def white_where_better(
     """What the rows pass: the `coloured` whitening, or each joint's residual RMS alone where that predicts better.
 
     The spectrum of the noise says whether there is a rest. Where the model errs by more than the noise, weights by the
-    noise alone follow what the model does worst; judged by the error in N m on the folds. The RMS is that of the rows as
+    noise alone follow what the model does worst; judged by the error in N m on the folds. The RMS is that of rows as
     they are weighted: slow ones, which count less, must not make their joint's fast ones count less too.
     """
     step = stand(problem, state, coloured)
