@@ -23,9 +23,7 @@ def explain(
     """Share outside the current model, smallest torque that would show (N m or N), nearest other effect and angle."""
     starts = np.cumsum([0, *(len(one.Z) for one in found)])
     spans = [slice(a, b) for a, b in zip(starts[:-1], starts[1:], strict=True)]
-    Z = _full(rows, found, spans)
-    ZX = Z @ rows.X.reshape(Z.shape[1], -1)
-    raw = Z @ Z.T
+    raw, ZX = _products(rows, found, spans)
     left = raw - ZX @ linear.inverse @ ZX.T
     angle, near = _angles(left, spans)
     out = []
@@ -38,11 +36,24 @@ def explain(
     return tuple(out)
 
 
-def _full(rows: Rows, found: Sequence[Shown], spans: list[slice]) -> Float[np.ndarray, "columns nvT"]:
-    full = np.zeros((spans[-1].stop if spans else 0, *rows.y.shape), np.float32 if len(found) > 400 else np.float64)
-    for one, own in zip(found, spans, strict=True):
-        full[own, list(one.joints)] = one.Z
-    return full.reshape(len(full), rows.y.size)
+def _products(
+    rows: Rows, found: Sequence[Shown], spans: list[slice]
+) -> tuple[Float[np.ndarray, "columns columns"], Float[np.ndarray, "columns P"]]:
+    """Z Z' and Z X of the columns of all candidates, joint by joint: all columns in all rows would be large."""
+    count = spans[-1].stop if spans else 0
+    raw, ZX = np.zeros((count, count)), np.zeros((count, rows.X.shape[2]))
+    for joint, X in enumerate(rows.X):
+        there = [
+            (one.Z[:, list(one.joints).index(joint)], own)
+            for one, own in zip(found, spans, strict=True)
+            if joint in one.joints
+        ]
+        if there:
+            at = np.concatenate([np.arange(own.start, own.stop) for _, own in there])
+            Z = np.concatenate([columns for columns, _ in there])
+            raw[np.ix_(at, at)] += Z @ Z.T
+            ZX[at] += Z @ X
+    return raw, ZX
 
 
 def _angles(

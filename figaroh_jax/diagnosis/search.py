@@ -151,15 +151,15 @@ def find_causes(
         chosen = _chosen(problem, step, contenders, found, alpha / len(groups))
         if not chosen:
             break
-        before = step
-        for best in chosen[: MOST_CAUSES - len(found)]:
-            found.append(_found(problem, before, contenders, best, screened, p_values[-1], generator))
-            step = with_cause(problem, step, best.effect, whitening)
-        ways = {"late" if best.effect.about else kind(best.effect) for best in chosen}
-        promised = (1 - BROKEN) * chosen[0].verdicts.cost + BROKEN * before.verdicts.cost
+        chosen = chosen[: MOST_CAUSES - len(found)]
+        found += [_found(problem, step, contenders, best, screened, p_values[-1], generator) for best in chosen]
+        effects = [best.effect for best in chosen]
+        ways = {"late" if effect.about else kind(effect) for effect in effects}
+        promised = (1 - BROKEN) * chosen[0].verdicts.cost + BROKEN * step.verdicts.cost
         promised = promised if len(chosen) == 1 else np.inf
-        # their rows and columns are large; there is a best one, since some were chosen
-        del before, contenders, chosen, best  # pyright: ignore[reportPossiblyUnboundVariable]
+        del contenders, chosen  # what they leave of every row is large
+        for effect in effects:
+            step = with_cause(problem, step, effect, whitening)
         if ways != {"columns"}:
             give_back_holes()
             known, problem, screened = problem, friction_width(problem, step.state, whitening), None
