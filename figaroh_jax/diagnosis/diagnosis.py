@@ -47,6 +47,7 @@ from .reading import Reader, only_read
 from .rest import (
     beyond_noise,
     excess,
+    follows_others,
     lines,
     parts_of,
     predictable,
@@ -499,7 +500,9 @@ def _left(
     if not problem.layout.repeats and not found and not there:  # nor is it known how much of what is left is noise
         large = relative_rest(problem, joint.step.state, 0 * noise) > tolerance
         rough = roughly_predictable(problem, joint.step, whitening, tolerance)
-        there = bool((quiet & large).any() or rough.any())
+        cross = follows_others(problem, joint.step.state, tolerance)
+        left = left._replace(text=cross or left.text)
+        there = bool((quiet & large).any() or rough.any() or cross)
     moves = np.moveaxis(~resting(problem), 2, 0).reshape(joint.step.rows.y.shape)
     beyond, alone = (
         beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)[0]

@@ -27,6 +27,7 @@ __all__ = [
     "flexible_p",
     "friction_width",
     "rich_families",
+    "products",
     "rough_functions",
     "smooth_functions",
     "to_unit",
@@ -268,6 +269,15 @@ def rough_functions(motion: Motion, joint: int) -> list[Float[np.ndarray, "k nN"
     others = [np.asarray(x).T for x in (motion.direction, motion.velocity, motion.acceleration)]
     beside = np.concatenate([np.delete(x, joint, axis=0) for x in others])
     return [*(waves[k : k + 2].reshape(4, -1) for k in range(FINEST - 1)), *([beside] if len(beside) else [])]
+
+
+def products(motion: Motion) -> tuple[Float[np.ndarray, "k nN"], list[tuple[int, int, int]]]:
+    """All joints' positions and velocities, from -1 to 1, and the products of each two; and of each product where both
+    factors and it stand."""
+    x = to_unit(np.concatenate([np.asarray(motion.angle), np.asarray(motion.velocity)], axis=1)).T
+    one, other = np.triu_indices(len(x))
+    places = [(a, b, k) for k, (a, b) in enumerate(zip(one.tolist(), other.tolist(), strict=True), len(x))]
+    return np.concatenate([x, x[one] * x[other]]), places
 
 
 def dependences(motion: Motion, joint: int) -> dict[Dependence, Float[np.ndarray, "k nN"]]:

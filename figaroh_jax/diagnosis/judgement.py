@@ -136,9 +136,11 @@ def reasons_against(
     weighed = left_weighed(here.problem, joint.step.state, noise)  # rows at reversals say nothing of a law
     rests = beside_rest(each, [f.joints for f in found], strict, np.minimum(beyond, weighed), tolerance)
     if not all(rests):  # what passed for noise at a cause's joints may be what it stands in for
-        at, moving = sorted({j for f in found for j in f.joints}), ~np.any(resting(here.problem), axis=2)
+        # and what any rest looks like may be it whose joint has something else
+        places = [list(f.joints) if f.effect.beside_rest else list(range(here.problem.model.nv)) for f in found]
+        at, moving = sorted({j for own in places for j in own}), ~np.any(resting(here.problem), axis=2)
         rough = roughly_predictable(here.problem, joint.step, here.whitening, tolerance, moving, at)
-        rests = [rest or bool(rough[list(f.joints)].any()) for rest, f in zip(rests, found, strict=True)]
+        rests = [rest or bool(rough[own].any()) for rest, own in zip(rests, places, strict=True)]
     asked = (tolerance, kept_out.certain, searched.fading)
     against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
     return against | behind_joints([one for one, rest in zip(each, rests, strict=True) if rest], against)

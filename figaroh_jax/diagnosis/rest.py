@@ -14,15 +14,16 @@ from ..estimation.rows import Linear, Rows, tall
 from ..recordings.stacked import filter_rows
 from ..results import Dependence, Part, Verdict
 from .comparison import ground, judge_grown, t_needed, t_value
-from .flexible import Smooth, dependences, rough_functions
+from .flexible import Smooth, dependences, products, rough_functions
 from .holdout import residual_rms
 from .problem import Problem
 from .screening import CHUNK, Group, draw_noise, noise_squares
 from .state import State
-from .step import Step
+from .step import Step, stand
 from .thresholds import (
     FITTED,
     FITTED_SHARE,
+    FOLLOWS,
     LEAST_BEYOND,
     LEAST_SHARE,
     LINE_P,
@@ -41,6 +42,7 @@ __all__ = [
     "Significance",
     "beyond_noise",
     "excess",
+    "follows_others",
     "lines",
     "parts_of",
     "predictable",
@@ -245,6 +247,36 @@ def roughly_predictable(
                 found[joint] = True
                 break
     return found
+
+
+def follows_others(problem: Problem, state: State, tolerance: float) -> str:
+    """What product of two positions or velocities of the robot predicts half of what some joint leaves, on data that it
+    was not fitted to, in words; empty without any.
+
+    Without repeats a torque that follows other joints passes for slow noise. All rows of a joint count alike: the
+    spectrum of the noise holds what is asked for.
+    """
+    size = residual_rms(problem, state)
+    large = np.flatnonzero(relative_rest(problem, state, np.zeros_like(size)) > tolerance).tolist()
+    if problem.layout.repeats or not large:
+        return ""
+    white = np.ones((len(problem.records.omega), 1)) / np.maximum(size, 1e-12 * size.max())
+    step = stand(problem, state, white)
+    base, (columns, places) = ground(step.verdicts, step.state.prior, step.folded), products(step.state.motion)
+    for joint in large:
+        rows, X = _rows_at(problem, step.state, columns, white, joint), step.rows.X[joint]
+        across, pull = X.T @ rows.T, rows @ step.verdicts.residual[joint]
+        gram = rows @ rows.T - across.T @ base.inverse[-1] @ across
+        taken = [pull[at] @ np.linalg.lstsq(gram[np.ix_(at, at)], pull[at], rcond=None)[0] for at in map(list, places)]
+        best, names = list(places[int(np.argmax(taken))]), problem.model.joint_names
+        grown = judge_grown(step.rows, base, (joint,), rows[best][:, None])
+        worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, grown))
+        surely = t_value(worse, better) > t_needed(len(worse), T_REST, len(large))
+        if surely and better.sum() < (1 - FOLLOWS) * worse.sum():
+            what = [f"{('position', 'velocity')[k // len(names)]} of {names[k % len(names)]}" for k in best[:2]]
+            share = 1 - float(better.sum() / worse.sum())
+            return f"{share:.0%} of what {names[joint]} leaves goes with the {what[0]} times the {what[1]}"
+    return ""
 
 
 def parts_of(

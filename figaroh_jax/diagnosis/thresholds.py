@@ -90,6 +90,7 @@ REPEATED, REPEATED_SHARE = 0.08, 0.05  # excess that repeats: absolute, and as a
 OF_REPEATED = 2.0  # times the squares that repeats have in common: what is louder than noise by more is of one alone
 FITTED, FITTED_SHARE = 0.03, 0.03  # excess that a flexible model or the catalogue still scores on
 UNREPEATED = 0.01  # the same where no recording repeats another
+FOLLOWS = 0.5  # of the squares that a joint leaves: what a product of two joints' motion predicts is no slow noise
 T_REST = 2.3  # t of the blocks: that smooth functions predict the rest on data they were not fitted to
 LEAST_BEYOND = 0.05  # times the noise power: below, nothing is said of what a joint's rest goes with
 LEAST_SHARE = 0.05  # of the power beyond the noise: a dependence that is told
