@@ -521,6 +521,7 @@ def _beside_smooth(
     if bare is None:
         without = judge(step.rows, full, sums, place)
     else:
+        del full  # its columns are large
         without = judge(bare.rows, _with_smooth(grown, bare))
     alone, both, smooth = (v.own(step.rows, joints).sum() for v in (step.verdicts, within, without))
     return 1 - float(min(alone, both) / max(smooth, 1e-300))
