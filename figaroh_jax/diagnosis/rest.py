@@ -275,7 +275,7 @@ def follows_others(problem: Problem, state: State, tolerance: float) -> str:
         if surely and better.sum() < (1 - FOLLOWS) * worse.sum():
             what = [f"{('position', 'velocity')[k // len(names)]} of {names[k % len(names)]}" for k in best[:2]]
             share = 1 - float(better.sum() / worse.sum())
-            return f"{share:.0%} of what {names[joint]} leaves goes with the {what[0]} times the {what[1]}"
+            return f"{100 * share:.3g} % of what {names[joint]} leaves goes with the {what[0]} times the {what[1]}"
     return ""
 
 
