@@ -136,7 +136,7 @@ def reasons_against(
     weighed = left_weighed(here.problem, joint.step.state, noise)  # rows at reversals say nothing of a law
     rests = beside_rest(each, [f.joints for f in found], strict, np.minimum(beyond, weighed), tolerance)
     if not all(rests):  # what passed for noise at a cause's joints may be what it stands in for
-        # and what any rest looks like may be it whose joint has something else
+        # what any rest looks like may stand in for something at another joint, too
         places = [list(f.joints) if f.effect.beside_rest else list(range(here.problem.model.nv)) for f in found]
         at, moving = sorted({j for own in places for j in own}), ~np.any(resting(here.problem), axis=2)
         rough = roughly_predictable(here.problem, joint.step, here.whitening, tolerance, moving, at)

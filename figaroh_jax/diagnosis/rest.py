@@ -268,7 +268,7 @@ def follows_others(problem: Problem, state: State, tolerance: float) -> str:
         across, pull = X.T @ rows.T, rows @ step.verdicts.residual[joint]
         gram = rows @ rows.T - across.T @ base.inverse[-1] @ across
         taken = [pull[at] @ np.linalg.lstsq(gram[np.ix_(at, at)], pull[at], rcond=None)[0] for at in map(list, places)]
-        best, names = list(places[int(np.argmax(taken))]), problem.model.joint_names
+        best, names = list(places[int(np.argmax(taken))]), problem.model.dof_names
         grown = judge_grown(step.rows, base, (joint,), rows[best][:, None])
         worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, grown))
         surely = t_value(worse, better) > t_needed(len(worse), T_REST, len(large))
