@@ -305,7 +305,7 @@ class Effect(eqx.Module):
     dissipative: ClassVar[bool] = False  # whether amplitudes below zero would feed energy to the robot
     rubs: ClassVar[bool] = False  # whether it is friction though not `dissipative`, a correction of another law say
     speed_law: ClassVar[bool] = False  # whether it is a law of dry friction over the speed, one of several alike
-    bends: ClassVar[bool] = False  # whether, below zero, it may bend what viscous friction makes rise: not turn it down
+    bends: ClassVar[bool] = False  # whether it may bend what viscous friction makes rise, but not turn it down
     of_position: ClassVar[bool] = False  # whether it follows the position of its joint alone, as weight may
     beside_rest: ClassVar[bool] = True  # whether it can be told from a rest that stays; no law of what any rest does
     fades: ClassVar[bool] = False  # whether it goes by the time since the start: another recording has it no more
