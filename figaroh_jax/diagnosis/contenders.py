@@ -21,7 +21,7 @@ from .design import BATCH, kind, shapes, unit_rows, units, with_shape
 from .estimates import torque_slope
 from .joint import POLISH, polished
 from .problem import Problem
-from .refit import Whitened, refit, refit_shift, shift_profile
+from .refit import Whitened, refit, refit_shift
 from .screening import Group, Screen
 from .shifts import torque_change
 from .state import State, batched, extended_state, link_motion, solved
@@ -129,10 +129,7 @@ def contend(
     if way != "columns":
         near = _to_first_order(step, base, group, int(order[0]))
         if not worth_trying(step, near):
-            far = _farther(problem, step, ready, group, near) if way == "position" else None
-            if far is None:
-                return near
-            fitted[group.name] = far
+            return near
     if way == "response":
         first = jax.tree.map(lambda x: x[order[0]], group.effect)
         return _response_contender(problem, step, whitening, group, first)
@@ -313,25 +310,6 @@ def _position_contender(
     held = prior if loose is None else believed(problem, loose, sums)
     verdicts = judge(rows, Hypothesis(rows.X, held, change), sums)
     return Contender(group.name, effect, verdicts, acting(effect, len(rows.y), group.columns.joints), free)
-
-
-def _farther(problem: Problem, step: Step, ready: Whitened, group: Group, near: Contender) -> Effect | None:
-    """A size of a shift whose exact torque explains more than any does to first order, where that could pass for a
-    gain.
-
-    Near its resonance the torque of a load on a soft gear is not what it is to first order: that may gain nothing where
-    the exact one takes half of the joint's squares.
-    """
-    ((name, _),) = group.effect.parameters().items()
-    sizes, squares = np.asarray(getattr(group.effect, name)), (step.verdicts.error**2).sum(1)[list(near.joints)].sum()
-    drop = step.verdicts.cost - near.verdicts.cost
-    if len(sizes) < 2 or drop < GAIN / 2 * squares:
-        return None
-    change = torque_change(group.effect, step.state.motion, problem.records)
-    rows = np.stack([filtered_rows(problem.records, one, ready.whitening) for one in change])
-    profile = shift_profile(rows, ready)
-    best = int(np.argmin(profile))
-    return jax.tree.map(lambda x: np.asarray(x)[best], group.effect) if -profile[best] > drop else None
 
 
 def _limit_contender(
