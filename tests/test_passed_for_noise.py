@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from generators import robots
 from generators.case import Case
-from generators.inverse import make_case
+from generators.inverse import draw_case, make_case, record_case
 
 import figaroh_jax as fj
 from benchmarks.hide_and_name.stiction import make_stiction_case
@@ -86,6 +86,24 @@ def test_what_a_fit_had_lost_is_named_and_sized(effect: str, seed: int, scale: f
 
 
 @needs_robots
+@pytest.mark.parametrize(
+    ("robot", "seed", "scale", "colour"), [("ur10e", 1654321527, 1.0, "white"), ("panda", 28229906, 2.0, "ar100")]
+)
+def test_a_gear_on_which_the_link_swings_in_the_band_of_its_motion_is_named(
+    robot: str, seed: int, scale: float, colour: str
+):
+    """To first order its torque explains nothing; two gains were named for the UR10e's, the Panda's was unknown."""
+    if not robots.available(robot):
+        pytest.skip(f"FIGAROH_JAX_DATA has no {robot}")
+    drawn = draw_case([("joint_elasticity", 0.15)], robot, 3, seed)
+    case = record_case(drawn, 2, scale, colour=colour, encoder_step=1e-4)
+    (cause,) = diagnosed(case).causes
+    (truth,) = case.truth
+    assert (cause.name.effect, cause.name.at) == (truth.effect, truth.at)
+    size = cause.parameters["compliance"]
+    assert abs(size.value - truth.parameters["compliance"]) < 3 * size.std
+
+
 @pytest.mark.parametrize("robot", ["tx40", "panda"])
 def test_a_torque_that_follows_other_joints_is_not_told_as_noise(robot: str):
     """36 s without repeats: a product of a position and a velocity of two other joints, which the catalogue lacks, was

@@ -126,8 +126,8 @@ def units(batches: Mapping[str, Effect], motion: Motion, records: Records) -> di
             torque = np.broadcast_to(np.asarray(motion.total).T, (len(joints), 1, *np.shape(motion.total)[::-1]))
             out[name] = Units(torque, joints, (factors[name] - 1) / _size(batch)[:, None])
         elif _way(batch) == "position":
-            # finds; `shifted` with its turns decides
-            torque = torque_change(batch, motion, records, turns=0) / _size(batch)[:, None, None]
+            # finds, near a resonance too (one step of Newton's method knows it); `shifted` with its turns decides
+            torque = torque_change(batch, motion, records, turns=1) / _size(batch)[:, None, None]
             out[name] = Units(np.swapaxes(torque, 1, 2)[:, None], joints)
         else:
             out[name] = Units(_changed_torques(batch, motion, records), joints)

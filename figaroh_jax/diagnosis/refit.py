@@ -171,7 +171,8 @@ def refit_shift(
 
     `effects` are the grid of its size, `Z` their columns. The profile of a shift has one valley. It is searched
     with a difference for its gradient: that of the inverse dynamics takes longer to compile than all the values that a
-    search in one number needs. The load is that of the motion as read: right to first order, near enough to begin with.
+    search in one number needs. One step of Newton's method gives the true motion: near enough to begin with, also where
+    the link swings on the gear in the band of the motion, which no first order shows.
     """
     ((name, parameter),) = effects.parameters().items()
     sizes, one = np.asarray(getattr(effects, name)), jax.tree.map(lambda x: np.asarray(x)[:1], effects)
@@ -185,7 +186,7 @@ def refit_shift(
         size = low + u[0] * (high - low)
         both = jax.tree.map(lambda x: np.repeat(x, 2, axis=0), one)
         both = with_shape(both, [name], [np.append(size, size + STEP * (high - low))])
-        change = torque_change(both, motion, records, as_read, turns=0)
+        change = torque_change(both, motion, records, as_read, turns=1)
         rows = unit_rows(Units(np.swapaxes(change, 1, 2)[:, None], joints), records, whitened.whitening)
         value, beside = shift_profile(rows, whitened)
         return np.array([value]), np.array([[(beside - value) / STEP]])
