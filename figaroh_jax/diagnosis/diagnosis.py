@@ -60,7 +60,7 @@ from .rest import (
     wrong_law,
 )
 from .screening import noise_squares
-from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without
+from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without, taken_beside
 from .setting import Setting, prepared_signals, setting_beside, setting_of
 from .standstill import left_moving, resting
 from .step import Step, stand, with_causes
@@ -178,14 +178,15 @@ def _searched(
     def ended(before: Setting, search: Search) -> Searched:
         here = before._replace(problem=search.problem, start=search.start)
         progress("fitting all causes together", 0.8)
-        found, joint = _told_apart(here, *_fitted_together(here, search.found, forbid, tolerance))
+        found, joint, gone = _fitted_together(here, search.found, forbid, tolerance)
+        found, joint = _told_apart(here, found, joint)
         left = _left(here, search, found, joint, forbid, tolerance, generator)
         strict = left.rest.there or left.excess > NO_REST or len(found) > FEW_CAUSES
         if not strict and (kept := _possible(found, joint)) != found:
             found, joint = kept, together(here, kept)
             left = _left(here, search, found, joint, forbid, tolerance, generator)
             strict = left.rest.there or left.excess > NO_REST
-        return Searched(before, here, search, found, joint, left, strict)
+        return Searched(before, here, search, found, joint, left, strict, gone)
 
     like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
 
@@ -224,17 +225,22 @@ def _borne_out(here: Setting, before: list[Found], one: Found) -> bool:
 
 def _fitted_together(
     here: Setting, found: list[Found], forbid: Sequence[str], tolerance: float
-) -> tuple[list[Found], Joint]:
-    """The causes that the others do not make needless and that surely have a size, all in one fit."""
-    found = eliminate(here.problem, here.start, found, here.whitening)
+) -> tuple[list[Found], Joint, tuple[Nearest, ...]]:
+    """The causes that the others do not make needless and that surely have a size, all in one fit; and the others."""
+    problem, start, whitening = here.problem, here.start, here.whitening
+    found, needless = eliminate(problem, start, found, whitening)
+    gone = [Nearest(one.name, share, _NEEDLESS) for one, share in needless]
     joint = together(here, found)
     kept = _simple(here, found, joint, forbid, tolerance)
     if kept != found:
         joint = together(here, kept)
     found, kept = kept, sized(kept, joint, forbid)
     if len(kept) < len(found):
+        for one in (f for f in found if f.name not in [k.name for k in kept]):
+            share, _ = taken_beside(problem, start, joint.step, found, one, whitening)
+            gone.append(Nearest(one.name, share, f"{_UNSURE}: {_told_size(joint, found.index(one), here)}"))
         joint = together(here, kept)
-    return kept, joint
+    return kept, joint, tuple(gone)
 
 
 def _told_apart(here: Setting, found: list[Found], joint: Joint) -> tuple[list[Found], Joint]:
@@ -334,12 +340,13 @@ def _judged(
     if rest and named:
         gaining = gaining._replace(joint=_beside_rest(here, named, joint))
     parts = parts_of(problem, told, searched.here.whitening, left.line, [s.name for s in reader.signals])
-    nearest.sort(key=lambda one: -one.share)
     quiet = not rest and not named and (large or searched.search.p_value < alpha)
     why = tolerated(float(relative.max()), tolerance, sticks, read) if quiet or read else ""
     unsure, more = "", _SETTLE_FIRST if contradictions else ""
     if quiet and not why:  # asked of the rows that the second opinions were asked of
         unsure, more = undecided(searched.here.problem, searched.joint.step.state)
+    nearest += [one for one in searched.gone if one.name not in against]
+    nearest.sort(key=lambda one: -one.share)
     told_rest = Rest(relative, parts, tuple(nearest), text, why, unsure, tuple(contradictions))
     return _Judged(verdict(bool(named), rest), gaining, told_rest, sticks, here, more)
 
@@ -424,7 +431,7 @@ def _answered(
         by_speed = by_speed if len(first) == len(named) else together(searched.here, named)
         first, moving = named, as_weighed_in_motion(searched.here, by_speed) if named else by_speed
         if (least := least_sure(moving)) is not None:
-            why = f"its size is not surely above zero: {_told_size(moving, least, here)}"
+            why = f"{_UNSURE}: {_told_size(moving, least, here)}"
         elif (least := without_a_number(gaining.joint)) is not None:
             why = "none of its ten numbers is surely there"
         elif (least := _as_links(named, gaining.joint)) is not None:
@@ -562,6 +569,8 @@ def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judge
     )
 
 
+_NEEDLESS = "beside the other causes it predicts nothing more of the held-out data: they explain the same misfit"
+_UNSURE = "its size is not surely above zero"
 _SETTLE_FIRST = "none before what looks wrong is settled: put it right in the task or the recording, and diagnose again"
 _LESS_THAN_NOISE = "less is left than the noise is estimated to be, so part of that estimate is an error of the model"
 _LINKS_HELD = (

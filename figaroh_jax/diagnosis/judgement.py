@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..results import Name
+from ..results import Name, Nearest
 from .answer_fit import together
 from .floor import noise_rms, short, sober_spectrum
 from .gaining import Fall, beside_all, foretells
@@ -67,6 +67,7 @@ class Searched(NamedTuple):
     joint: Joint
     left: Left
     strict: bool  # whether a rest stays, beside which a cause must show more to be named
+    gone: tuple[Nearest, ...] = ()  # causes that the others made needless, or of no sure size beside them
     fading: tuple[Name, ...] = ()  # causes that were there and are gone in recordings kept out
 
 

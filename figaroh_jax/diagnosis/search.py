@@ -49,6 +49,7 @@ __all__ = [
     "find_causes",
     "judged_without",
     "stood_without",
+    "taken_beside",
 ]
 
 NEAR, CLOSER = 4, 800  # times the level: p-values below which few draws cannot tell from it; draws that can
@@ -376,35 +377,41 @@ def _takes_most(step: Step, best: Contender, rival: Contender) -> bool:
     return best.effect.acts_on == "joint" and rival.effect.body and gain > MOST_OF_A_GAIN * most
 
 
-def eliminate(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> list[Found]:
-    """The causes without those that no longer predict anything once the others are in, the least of them first.
+def eliminate(
+    problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]
+) -> tuple[list[Found], list[tuple[Found, float]]]:
+    """The causes without those that no longer predict anything once the others are in, the least of them first; and
+    those, each with the share of its joints' held-out squares that it took beside the others.
 
     One that came in last may make an earlier one needless and be the lesser of the two: which of them goes must not
     hang on their order.
     """
+    gone: list[tuple[Found, float]] = []
     if len(found) < 2:
-        return found
+        return found, gone
     full = with_causes(problem, start, [f.effect for f in found], whitening, keep=True)
     asked = list(found)
     while len(found) > 1:
-        needs = [(_needed(problem, start, full, found, one, whitening), k) for k, one in enumerate(asked)]
-        needless = sorted(n for n in needs if n[0] < 1)
+        taken = [taken_beside(problem, start, full, found, one, whitening) for one in asked]
+        needs = [min(share / GAIN, t / T_BETTER) for share, t in taken]
+        needless = sorted((need, k) for k, need in enumerate(needs) if need < 1)
         if not needless:
             break
+        gone.append((asked[needless[0][1]], taken[needless[0][1]][0]))
         asked = [asked[k] for _, k in needless]
         found, asked = [f for f in found if f is not asked[0]], asked[1:]
         full = with_causes(problem, start, [f.effect for f in found], whitening, keep=True)
     problem.begun.clear()  # their columns are large
-    return found
+    return found, gone
 
 
-def _needed(
+def taken_beside(
     problem: Problem, start: State, full: Step, found: list[Found], one: Found, whitening: Float[np.ndarray, "F nv"]
-) -> float:
-    """How much of a cause's gain is left beside all others, by what the gates ask for: below 1 it is not enough."""
+) -> tuple[float, float]:
+    """Share of the held-out squares of its joints that a cause takes beside all others, and the t of that."""
     without = judged_without(problem, start, full, found, one, whitening)
     worse, better = (v.own(full.rows, one.joints) for v in (without, full.verdicts))
-    return min((1 - float(better.sum() / worse.sum())) / GAIN, t_value(worse, better) / T_BETTER)
+    return 1 - float(better.sum() / worse.sum()), t_value(worse, better)
 
 
 def judged_without(
