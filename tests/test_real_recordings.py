@@ -62,6 +62,26 @@ def test_the_error_on_recordings_kept_out_is_no_larger_than_that_of_identify(
     assert np.all(explained[: len(goals)] >= goals), explained
 
 
+def test_every_cause_that_the_search_found_is_named_or_told_with_the_reason_why_not(
+    data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A double pendulum, of which a scale of an encoder is found first and made needless by what comes in behind it."""
+    from benchmarks.hide_in_real.recordings import SETS as REAL
+    from figaroh_jax.diagnosis import diagnosis
+
+    found_by, find = [], diagnosis.find_causes
+    monkeypatch.setattr(diagnosis, "find_causes", lambda *a, **more: found_by.append(find(*a, **more)) or found_by[-1])
+    cases, run = tmp_path / "cases", tmp_path / "run"
+    run.mkdir()
+    task = load_task(blackbox.write_task(cases, run, twin_of(cases, REAL["dfki_double_pendulum"]())))
+    answer = diagnose_task(task)
+    told = {cause.name for cause in answer.causes} | {near.name for near in answer.rest.nearest}
+    assert found_by[-1].found and {one.name for one in found_by[-1].found} <= told
+    like_a_rest = {one.name for search in found_by for one in search.found if one.effect.name == "presliding"}
+    assert like_a_rest and like_a_rest <= told  # the search had been taken up again without it, and it was not told
+    assert all(near.why_not for near in answer.rest.nearest)
+
+
 @pytest.mark.slow
 def test_a_spring_that_a_recording_kept_out_shows_is_no_slow_noise(data_dir: Path, tmp_path: Path) -> None:
     """15 s of a Panda, which show slow noise as readily as a spring; the 6 s kept out tell these apart."""

@@ -42,7 +42,7 @@ from .holdout import residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_rest, without_a_number
 from .judgement import KeptOut, Left, Searched, as_slow_noise, doubted_rest, reasons_against, standings_of, sticks_alone
 from .layout import describe_folds, repeats_not_said
-from .naming import beyond_simpler, strong
+from .naming import LIKE_A_REST, beyond_simpler, strong
 from .reading import Reader, only_read
 from .rest import (
     beyond_noise,
@@ -186,6 +186,9 @@ def _searched(
             found, joint = kept, together(here, kept)
             left = _left(here, search, found, joint, forbid, tolerance, generator)
             strict = left.rest.there or left.excess > NO_REST
+        if left.follows:
+            noise = here.spectrum.at_most(noise_rms(here.problem, here.spectrum), left.follows.noise)
+            here = here._replace(spectrum=noise)
         return Searched(before, here, search, found, joint, left, strict, gone)
 
     like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
@@ -205,11 +208,14 @@ def _searched(
         del first  # its rows and columns are large
     kept = search.found[:taken]
     fading = [f for f in search.found[taken:] if f.effect.fades and _borne_out(here, kept, f)]
+    left_out = [f for f in search.found[taken:] if f.effect.name in like_a_rest and f not in fading]
     begun = Begun(kept + fading, search.p_value, search.shown)
     del search
     give_back_holes()
     search = find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun)
-    return ended(here, search)._replace(fading=tuple(f.name for f in fading))
+    last = ended(here, search)
+    gone = (*last.gone, *(Nearest(f.name, f.share, LIKE_A_REST) for f in left_out))
+    return last._replace(gone=gone, fading=tuple(f.name for f in fading))
 
 
 def _borne_out(here: Setting, before: list[Found], one: Found) -> bool:
@@ -495,7 +501,7 @@ def _left(
     left = significance(now, max(before, 0.0), p_left, flexible, line, joints, predicted, tolerable)
     wrong = bool(found) and wrong_law(found[0].name.at, found[0].cost[0] - found[0].cost[1], flexible)
     loud, quiet = beyond_noise(problem, joint.step.linear.residual, spectrum, whitening, generator)
-    there, rows, linear = left.there, joint.step.rows, joint.step.linear
+    there, rows, linear, follows = left.there, joint.step.rows, joint.step.linear, None
     if not there and not tolerable and (wrong or loud.any()):
         # of few rows a rich model's residual is less than the noise, and what repeats do not repeat is no misfit
         again = loud <= OF_REPEATED * repeating(problem, rows, linear.residual, np.ones(linear.residual.shape, bool))
@@ -507,9 +513,9 @@ def _left(
     if not problem.layout.repeats and not found and not there:  # nor is it known how much of what is left is noise
         large = relative_rest(problem, joint.step.state, 0 * noise) > tolerance
         rough = roughly_predictable(problem, joint.step, whitening, tolerance)
-        cross = follows_others(problem, joint.step.state, tolerance)
-        left = left._replace(text=cross or left.text)
-        there = bool((quiet & large).any() or rough.any() or cross)
+        follows = follows_others(problem, joint.step.state, tolerance)
+        left = left._replace(text=follows.text if follows else left.text)
+        there = bool((quiet & large).any() or rough.any() or follows)
     moves = np.moveaxis(~resting(problem), 2, 0).reshape(joint.step.rows.y.shape)
     beyond, alone = (
         beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)[0]
@@ -521,7 +527,9 @@ def _left(
     misfit = (alone > 0) | (relative_rest(problem, first.state, noise) > tolerance)
     followed = flexible.each * (predicted and flexible.p < REST_P)
     moved = (alone > 0) | (left_moving(problem, first.state, noise) > tolerance)
-    return Left(left._replace(there=there), p_left, now[0], line, flexible.each, beyond, misfit, followed, moved)
+    return Left(
+        left._replace(there=there), p_left, now[0], line, flexible.each, beyond, misfit, followed, moved, follows
+    )
 
 
 def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:

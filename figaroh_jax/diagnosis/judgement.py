@@ -24,7 +24,7 @@ from .naming import (
     stands_alone,
     stands_out,
 )
-from .rest import Significance, relative_rest, roughly_predictable
+from .rest import Follows, Significance, relative_rest, roughly_predictable
 from .search import Found, Search, chance_beside
 from .setting import Setting
 from .standstill import left_weighed, only_sticks, resting
@@ -55,6 +55,7 @@ class Left(NamedTuple):
     misfit: Bool[np.ndarray, " nv"]  # whether, without any cause, they are, or are more than is tolerable
     followed: Float[np.ndarray, " nv"]  # `more` where such functions surely predict what was not fitted, else zero
     moved: Bool[np.ndarray, " nv"]  # `misfit` of the rows in which the joint moves
+    follows: Follows | None = None  # a joint of which it follows other joints
 
 
 class Searched(NamedTuple):
@@ -67,7 +68,7 @@ class Searched(NamedTuple):
     joint: Joint
     left: Left
     strict: bool  # whether a rest stays, beside which a cause must show more to be named
-    gone: tuple[Nearest, ...] = ()  # causes that the others made needless, or of no sure size beside them
+    gone: tuple[Nearest, ...] = ()  # causes that came in and went before they were judged
     fading: tuple[Name, ...] = ()  # causes that were there and are gone in recordings kept out
 
 

@@ -55,6 +55,7 @@ from .thresholds import (
 )
 
 __all__ = [
+    "LIKE_A_REST",
     "Standing",
     "behind_joints",
     "beside_rest",
@@ -105,6 +106,7 @@ class Standing:
     contested: bool = False  # whether another law of the whole robot, one that cannot be, surely takes much beside it
 
 
+LIKE_A_REST = "the unexplained residual may imitate it: it is named only where nothing else is left"
 _VARIES = "its amplitude varies with position, speed, load or time (that would add"
 
 
@@ -182,10 +184,7 @@ def _of_those_beside_rest(
     yield (not one.everywhere, "a law of the whole robot explains as much where it acts, and more is left")
     yield (not one.cancels, "it cancels most of the joint's torque, as no gain beside another cause does")
     yield (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion explain as much")
-    yield (
-        one.beside_rest or not rest or one.name in fading,
-        "the unexplained residual may imitate it: it is named only where nothing else is left",
-    )
+    yield (one.beside_rest or not rest or one.name in fading, LIKE_A_REST)
     yield (
         not one.one_part,
         "of its inertia, damping and friction no more than one is surely there, as where it stands for another law",

@@ -39,6 +39,7 @@ from .thresholds import (
 from .weights import relative_speed
 
 __all__ = [
+    "Follows",
     "Significance",
     "beyond_noise",
     "excess",
@@ -249,9 +250,16 @@ def roughly_predictable(
     return found
 
 
-def follows_others(problem: Problem, state: State, tolerance: float) -> str:
+class Follows(NamedTuple):
+    """A joint whose residual follows other joints."""
+
+    text: str
+    noise: Float[np.ndarray, " nv"]  # RMS of each joint's rows that may be noise, N m or N; infinite but at this joint
+
+
+def follows_others(problem: Problem, state: State, tolerance: float) -> Follows | None:
     """What product of two positions or velocities of the robot predicts half of what some joint leaves, on data that it
-    was not fitted to, in words; empty without any.
+    was not fitted to; None without any.
 
     Without repeats a torque that follows other joints passes for slow noise. All rows of a joint count alike: the
     spectrum of the noise holds what is asked for.
@@ -259,7 +267,7 @@ def follows_others(problem: Problem, state: State, tolerance: float) -> str:
     size = residual_rms(problem, state)
     large = np.flatnonzero(relative_rest(problem, state, np.zeros_like(size)) > tolerance).tolist()
     if problem.layout.repeats or not large:
-        return ""
+        return None
     white = np.ones((len(problem.records.omega), 1)) / np.maximum(size, 1e-12 * size.max())
     step = stand(problem, state, white)
     base, (columns, places) = ground(step.verdicts, step.state.prior, step.folded), products(step.state.motion)
@@ -274,9 +282,12 @@ def follows_others(problem: Problem, state: State, tolerance: float) -> str:
         surely = t_value(worse, better) > t_needed(len(worse), T_REST, len(large))
         if surely and better.sum() < (1 - FOLLOWS) * worse.sum():
             what = [f"{('position', 'velocity')[k // len(names)]} of {names[k % len(names)]}" for k in best[:2]]
-            share = 1 - float(better.sum() / worse.sum())
-            return f"{100 * share:.3g} % of what {names[joint]} leaves goes with the {what[0]} times the {what[1]}"
-    return ""
+            left = float(better.sum() / worse.sum())
+            text = f"{100 * (1 - left):.3g} % of what {names[joint]} leaves goes with the {what[0]} times the {what[1]}"
+            most = np.full(len(size), np.inf)
+            most[joint] = size[joint] * np.sqrt(left)
+            return Follows(text, most)
+    return None
 
 
 def parts_of(

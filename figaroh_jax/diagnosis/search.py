@@ -81,6 +81,7 @@ class Found:
     alike: tuple[Name, ...] = ()  # what else explains much of the same misfit, though not as well
     instead: tuple[Rival, ...] = ()  # of the `ambiguous` those that were fitted in its place
     outdone: bool = False  # whether what could be named in its place predicts better in nearly all draws of the blocks
+    share: float = 0.0  # of the held-out squares of its joints, as it came in
 
     def as_another(self, other: Rival, alike: Iterable[Name]) -> Found:
         """The same cause by another's name, effect and joints; `alike` is what then cannot be told from it."""
@@ -351,6 +352,7 @@ def _found(
     own = float(wins[0] + wins[1:][outer].sum())
     # where the links are not well known, those that they can stand for are no names
     apart = np.array([problem.trust <= c.effect.needs_trust and physical_sign(c.effect) for c in alike], bool)
+    before, after = (v.own(step.rows, best.joints) for v in (step.verdicts, best.verdicts))
     return Found(
         name=best.name,
         effect=best.effect,
@@ -364,6 +366,7 @@ def _found(
         alike=tuple(c.name for c in alike if step.verdicts.cost - c.verdicts.cost > SHARE_ALIKE * drop),
         instead=tuple(Rival(c.name, c.effect, c.joints) for c in alike if c.name in open_to),
         outdone=own < OUTDONE * (own + wins[1:][apart & ~outer].sum()),
+        share=1 - float(after.sum() / before.sum()),
     )
 
 

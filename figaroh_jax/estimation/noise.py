@@ -67,6 +67,11 @@ class Spectrum(NamedTuple):
         basis = _basis(np.clip(frequency, self.known, self.nyquist), self.nyquist)
         return np.exp(basis @ (self.coefficients + off))
 
+    def at_most(self, rms: Float[np.ndarray, " nv"], most: Float[np.ndarray, " nv"]) -> Spectrum:
+        """The spectrum, which has `rms` in the rows of each joint, with no more than `most` in them."""
+        lower = 2 * np.log(np.minimum(1.0, most / np.maximum(rms, 1e-300)))
+        return self._replace(coefficients=self.coefficients + np.outer(np.arange(len(self.coefficients)) == 0, lower))
+
     def rise(self, frequency: Float[np.ndarray, " freqs"]) -> Float[np.ndarray, "freqs nv"]:
         """Power that noise is expected to have, over what `drawn` gives it; 1 but below `known`.
 
