@@ -370,6 +370,8 @@ def test_a_ripple_is_shown_by_a_motion_over_more_than_a_turn_of_it(model: RobotM
     low, high = np.full(model.nv, -0.5), np.full(model.nv, 0.5)
     assert not ripple.shown_by(low, high * 2 * np.pi / float(ripple.order))
     assert ripple.shown_by(low * 2 * np.pi * 4 / float(ripple.order), high * 2 * np.pi * 4 / float(ripple.order))
+    slowest = eqx.tree_at(lambda e: e.order, ripple, type(ripple).parameters()["order"].lower)
+    assert not slowest.shown_by(10 * low, 10 * high)  # over four turns of it: a slower one would do better
 
 
 @pytest.mark.parametrize("name", PARAMETERS)

@@ -134,6 +134,16 @@ def test_friction_that_a_law_turns_down_is_no_friction():
 
 
 @needs_robots
+@pytest.mark.slow
+def test_the_slowest_of_all_ripples_is_no_ripple():
+    """A tilt left out had been a ripple of the base's joint, of the least order that is looked for (2.9 +- 1.4)."""
+    case = make_stiction_case([("gravity_tilt", 0.1)], "tx40", 1, 4, 1113592688)
+    found = diagnosed(case, ["gravity_tilt"])
+    assert found.verdict == "unknown" and found.causes == ()
+    assert "slower function" in {near.name.effect: near.why_not for near in found.rest.nearest}["torque_ripple"]
+
+
+@needs_robots
 def test_presliding_is_not_what_samples_make_of_friction():
     """Its wide reversal was read as that of dry friction between two samples: `nothing`, at 11 % of the torque."""
     hidden = make_case([("presliding", 0.15)], "tx40", 1, 4, 0.5, 1232811719, colour="ar20", encoder_step=1e-4)

@@ -97,6 +97,7 @@ class Standing:
     complete: bool = False  # whether smooth functions find next to nothing in what it leaves at its joints
     spoils: bool = False  # whether, of the whole robot, it surely predicts some joint worse
     outdone: bool = False  # whether what could be named in its place surely predicts better
+    shown: bool = True  # whether the motion tells it, as fitted, from any smooth law (`Effect.shown_by`)
     taken: float = 0.0  # held-out squares of its joints that it removes
     leaves: float = 0.0  # squares beyond noise at its joints over these
     followed: float = 0.0  # squares that smooth functions surely find in what it leaves at its joints, over these
@@ -134,6 +135,7 @@ def _of_all(one: Standing, tolerance: float) -> Iterator[tuple[bool, str]]:
     """What every cause is asked, with why it is not named where it fails."""
     strict_law = one.whole or one.alone  # what else is wrong at a joint makes its law's amplitude vary
     yield (one.physical, "its fitted sign is physically impossible")
+    yield (one.shown, "the motion does not tell it from a slower function of the position")
     yield (one.gain > 0, f"it does not improve the prediction of held-out data (gain {one.gain:.2g})")
     yield (
         one.share >= tolerance,
@@ -329,6 +331,7 @@ def standings(
                 and _spoils(*(_by_joint(problem, v, full) for v in (without, full.verdicts))),
                 everywhere=not whole and any(name.effect in EVERYWHERE for name in one.ambiguous),
                 outdone=one.outdone,
+                shown=effect.shown_by(*problem.reached),
                 massless=effect.body and _deviations(effect, joint.fitted, at)["mass"] < MASS,
             )
         )

@@ -114,9 +114,12 @@ class TorqueRipple(JointEffect):
         return self.sine * jnp.sin(angle) + self.cosine * jnp.cos(angle)
 
     def shown_by(self, low: Float[np.ndarray, " nv"], high: Float[np.ndarray, " nv"]) -> bool:
-        """Whether the motion covers one and a half periods: less could be any smooth function of the position."""
-        # one and a half periods: what has not come back is any smooth function of the position
-        return bool(float(self.order) * (high - low)[int(self.at[0])] > 3 * np.pi)
+        """Whether the motion covers one and a half periods: less could be any smooth function of the position.
+
+        So could one whose order is the lowest of all: a slower one would do better.
+        """
+        covered = float(self.order) * (high - low)[int(self.at[0])] > 3 * np.pi
+        return bool(covered and float(self.order) > type(self).parameters()["order"].lower)
 
 
 @register
