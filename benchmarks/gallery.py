@@ -231,7 +231,8 @@ def shown(name: str, folder: Path) -> str:
         lines.append(
             f"| {title} | {' + '.join(cause['at']) or 'the robot'} | {'; '.join(sizes[:4]) or '–'} | {error} |"
         )
-    return "\n".join([*lines, "", *_left(answer), ""])
+    of = "of the error of the frames alone" if _result(folder / name / "run") else "at the joints, of their torque"
+    return "\n".join([*lines, "", *_left(answer, of), ""])
 
 
 def _known(parameter: dict[str, Any]) -> bool:
@@ -252,11 +253,11 @@ def _interval(parameter: dict[str, Any]) -> str:
     return wording.interval(Estimate(parameter["value"], std, parameter["unit"]))
 
 
-def _left(answer: dict[str, Any]) -> list[str]:
+def _left(answer: dict[str, Any], of: str) -> list[str]:
     """What stays without a name, as the answer says it."""
     rest = answer.get("rest") or {}
     sizes = [f"{100 * x:.1f} %" for x in rest.get("relative", [])]
-    lines = [f"Left at the joints, of their torque: {', '.join(sizes)}."] if sizes else []
+    lines = [f"Left {of}: {', '.join(sizes)}."] if sizes else []
     parts = sorted(rest.get("parts", []), key=lambda part: -part["share"])[:3]
     if parts:
         said = "; ".join(f"{part['kind']} at {', '.join(part['at'])} ({100 * part['share']:.0f} %)" for part in parts)

@@ -285,6 +285,8 @@ def so101_part(third: int | None, folder: str | None) -> Part:
 def so101_thirds(processes: int, folder: str | None) -> None:
     """All recordings whole, and without each third of them: what is named each time, and whether the sizes agree."""
     thirds = (None, 0, 1, 2)
+    if folder is not None:
+        Path(folder).mkdir(parents=True, exist_ok=True)
     if processes > 1:
         from concurrent.futures import ProcessPoolExecutor
         from multiprocessing import get_context

@@ -120,7 +120,7 @@ def test_a_torque_that_follows_other_joints_is_not_told_as_noise(robot: str):
     assert f"of what {names[j]} leaves goes with the position of {i} times the velocity of {k}" in found.rest.text, seed
     without = make_case([], robot, 1, 4, 1.0, seed, colour="pink", encoder_step=1e-5)
     noise = diagnosed(without).noise * loud(hidden) / loud(without)
-    # it was told eight times as large, and no rest at all
+    # it was told up to twenty times as large, and no rest at all
     assert abs(np.log(found.noise[j] / noise[j])) < np.log(2.4), (seed, found.noise[j], noise[j])
     assert int(np.argmax(found.rest.relative)) == j, seed
 
