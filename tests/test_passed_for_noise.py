@@ -85,7 +85,6 @@ def test_what_a_fit_had_lost_is_named_and_sized(effect: str, seed: int, scale: f
         assert abs(told[name].value - value) < 4.5 * told[name].std, name
 
 
-@needs_robots
 @pytest.mark.parametrize(
     ("robot", "seed", "scale", "colour"), [("ur10e", 1654321527, 1.0, "white"), ("panda", 28229906, 2.0, "ar100")]
 )

@@ -140,8 +140,11 @@ def less_the_model(rows: Whitened, residual: np.ndarray) -> Whitened:
     return rows._replace(residual=residual - taken.reshape(residual.shape))
 
 
-@pytest.mark.parametrize("truth", [5e-5, 3e-4, 2.4e-3, 4e-3])
-def test_the_compliance_that_made_noiseless_rows_is_found(motion: Motion, records: Records, truth: float) -> None:
+@pytest.mark.parametrize(("truth", "error"), [(5e-5, 0.01), (3e-4, 0.01), (2.4e-3, 0.025), (4e-3, 0.05)])
+def test_the_compliance_that_made_noiseless_rows_is_found(
+    motion: Motion, records: Records, truth: float, error: float
+) -> None:
+    """Rows of the true motion, of which the search knows one step of Newton's method."""
     made, rows = at_joint("joint_elasticity", joint=1, compliance=truth), whitened(records)
     effects = flattened(batch_of(candidates(find("joint_elasticity"), motion.model), 1))
     effects = jax.tree.map(lambda x: x[1], effects)
@@ -155,7 +158,7 @@ def test_the_compliance_that_made_noiseless_rows_is_found(motion: Motion, record
     rows = less_the_model(rows, residual)
     sizes = np.asarray(effects.compliance)  # pyright: ignore
     found = refit_shift(effects, changes(effects) / sizes[:, None, None], motion, records, rows)
-    np.testing.assert_allclose(found.compliance, truth, rtol=5e-2, atol=0)  # pyright: ignore
+    np.testing.assert_allclose(found.compliance, truth, rtol=error, atol=0)  # pyright: ignore
     tried = with_shape(batch_of(made, 3), ["compliance"], [truth * np.array([0.99, 1.0, 1.01])])
     low, best, high = shift_profile(changes(tried), rows)
     assert best < low and best < high
