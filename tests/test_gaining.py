@@ -73,6 +73,22 @@ def test_a_fall_in_every_block_is_sure_however_unlike_they_are():
     assert one.gains
 
 
+@pytest.mark.parametrize(
+    ("left", "blocks", "sure"), [(0.05, 8, True), (0.3, 8, False), (0.05, 5, False), (0.05, 12, True), (0.3, 12, True)]
+)
+def test_in_few_blocks_a_cause_is_beyond_doubt_where_it_takes_nearly_all_in_every_one(
+    left: float, blocks: int, sure: bool
+):
+    """Signs of eight blocks are never less likely than 1 in 256; stand-ins have taken .7 in every one of them."""
+    before = squares(np.random.default_rng(4), 4.0)[:, :blocks]
+    after = left * before
+    one = fall(before, after, [0])
+    assert one.own == pytest.approx(1 - left)
+    assert one.certainly(0.5) is sure
+    after[:, 2] = 1.1 * before[:, 2]
+    assert not fall(before[:, :8], after[:, :8], [0]).certainly(0.5)
+
+
 def test_a_cause_that_is_not_there_is_sure_as_often_as_the_level_says():
     """Its size is chance, made in other data; what these have of it is chance too, whether squares fall or not."""
     rng, chances = np.random.default_rng(4), []
@@ -207,6 +223,7 @@ def test_of_two_laws_the_one_that_surely_predicts_their_joints_better_is_preferr
     assert not predicts_better(problem, other, one, [0])
     even = first * (1 + 0.3 * rng.standard_normal(first.shape))
     assert not predicts_better(problem, one, cast(Any, even), [0, 1])
+    assert not predicts_better(problem, one, cast(Any, 0.995 * first), [0, 1])  # in every block, and no more
 
 
 def test_a_fit_of_another_weight_is_taken_where_all_rows_kept_out_surely_prefer_it(monkeypatch: pytest.MonkeyPatch):

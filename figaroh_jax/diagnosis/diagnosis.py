@@ -31,6 +31,7 @@ from ..simulators.native import as_backend
 from ..simulators.registry import backend as make_backend
 from .answer_fit import as_moves, as_predicts_best, as_weighed_in_motion, as_weighed_otherwise, together
 from .believed import impossible_links
+from .comparison import t_value
 from .estimates import amplitude_places, estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
@@ -64,7 +65,7 @@ from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_
 from .setting import Setting, prepared_signals, setting_beside, setting_of
 from .standstill import left_moving, resting
 from .step import Step, stand, with_causes
-from .thresholds import ALPHA_OF_A_NAME, AS_WELL, FEW_CAUSES, FOR_SURE, LINE_P, NO_REST, OF_REPEATED, REST_P
+from .thresholds import ALPHA_OF_A_NAME, AS_WELL, FEW_CAUSES, FOR_SURE, LINE_P, NO_REST, OF_REPEATED, REST_P, T_BETTER
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess, Task
@@ -169,10 +170,11 @@ def _searched(
     """The causes that the data show; where a rest stays, without the laws of one joint that any rest looks like.
 
     Beside a rest those (`Effect.beside_rest`) are not named, and take the place of causes that could be: the search is
-    taken up again from where the first of them came in. Such an effect of the whole robot stays: what it stands for
-    would go into several others, each of which would look sure. One that fades stays where recordings kept out, in
-    which it is no longer there, surely show it: what any rest looks like would be there again. Where many causes are
-    found, that is known before they are in one fit.
+    taken up again from where the first of them came in; or from all the others that were found, where that surely
+    predicts better. Such an effect of the whole robot stays: what it stands for would go into several others, each of
+    which would look sure. One that fades stays where recordings kept out, in which it is no longer there, surely show
+    it: what any rest looks like would be there again. Where many causes are found, that is known before they are in one
+    fit.
     """
 
     def ended(before: Setting, search: Search) -> Searched:
@@ -209,10 +211,17 @@ def _searched(
     kept = search.found[:taken]
     fading = [f for f in search.found[taken:] if f.effect.fades and _borne_out(here, kept, f)]
     left_out = [f for f in search.found[taken:] if f.effect.name in like_a_rest and f not in fading]
-    begun = Begun(kept + fading, search.p_value, search.shown)
+    others = [f for f in search.found if f not in left_out]
+    p_value, shown = search.p_value, search.shown
     del search
+    ends = []
+    for begun in (kept + fading, others) if len(others) > len(kept + fading) else (others,):
+        give_back_holes()
+        about = Begun(begun, p_value, shown)
+        ends.append(find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, about))
+    search = ends[-1] if t_value(ends[0].blocks, ends[-1].blocks) > T_BETTER else ends[0]
+    del ends
     give_back_holes()
-    search = find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, begun)
     last = ended(here, search)
     gone = (*last.gone, *(Nearest(f.name, f.share, LIKE_A_REST) for f in left_out))
     return last._replace(gone=gone, fading=tuple(f.name for f in fading))
@@ -259,11 +268,14 @@ def _told_apart(here: Setting, found: list[Found], joint: Joint) -> tuple[list[F
         for other in one.instead:
             if not physical_sign(other.effect) or other.name in [f.name for f in found]:
                 continue
-            effects = [other.effect if at == k else effect for at, effect in enumerate(joint.causes)]
             both = sorted({*one.joints} & {*other.joints})
-            if predicts_better(problem, joint.step, with_causes(problem, start, effects, whitening), both):
-                own = one.as_another(other, (one.name, *one.ambiguous))
-                found = [own if f is found[k] else f for f in found]
+            own, instead = (
+                with_causes(problem, start, [x if at == k else e for at, e in enumerate(joint.causes)], whitening)
+                for x in (joint.causes[k], other.effect)
+            )  # both in one step from the same start, which leaves all that they share alike
+            if predicts_better(problem, own, instead, both):
+                new = one.as_another(other, (one.name, *one.ambiguous))
+                found = [new if f is found[k] else f for f in found]
                 joint = polished(problem, start, [f.effect for f in found], whitening)
     return found, joint
 

@@ -20,7 +20,7 @@ from .problem import Problem
 from .search import Found, stood_without
 from .state import State
 from .step import Step, stand
-from .thresholds import BY_CHANCE, BY_CHANCE_BESIDE, BY_CHANCE_UNSHOWN, HELD, KEPT_OF_CLAIM, RISES
+from .thresholds import BY_CHANCE, BY_CHANCE_BESIDE, BY_CHANCE_UNSHOWN, GAIN, HELD, KEPT_OF_CLAIM, RISES
 
 __all__ = [
     "Fall",
@@ -35,6 +35,8 @@ __all__ = [
 ]
 
 EXACT, DRAWS = 12, 4000  # blocks up to which every choice of signs is made; choices beyond
+FEWEST = 6  # blocks that together say that a cause is there
+NEARLY_ALL = 0.9  # of the squares of its joints: a stand-in on a short recording took .7 in every block
 
 
 class Gaining(NamedTuple):
@@ -57,6 +59,7 @@ class Fall(NamedTuple):
     each: float  # sum over the joints of that share
     whole: float  # squares of all rows that go, N m or N, squared
     worse: float  # p-value of their rise
+    every: bool = False  # whether every block wants it, and there are more than a few
 
     @property
     def gains(self) -> bool:
@@ -80,9 +83,11 @@ class Fall(NamedTuple):
     def certainly(self, claim: float) -> bool:
         """Whether the joints where it acts show the cause beyond doubt.
 
-        Where few blocks have most of what it takes, slices cannot tell it from chance: a recording of its own can.
+        Where few blocks have most of what it takes, slices cannot tell it from chance: a recording of its own can. The
+        signs of a short one's few blocks are never so unlikely: there it takes nearly all that is left, in every block.
         """
-        return self.chance < BY_CHANCE_UNSHOWN and self.own >= KEPT_OF_CLAIM * claim
+        surely = self.chance < BY_CHANCE_UNSHOWN or (self.every and self.own > NEARLY_ALL)
+        return surely and self.own >= KEPT_OF_CLAIM * claim
 
 
 def fall(before: Held, after: Held, joints: Sequence[int]) -> Fall:
@@ -93,13 +98,15 @@ def fall(before: Held, after: Held, joints: Sequence[int]) -> Fall:
     size as fitted too, and tells little in few blocks.
     """
     places, (rows, moving) = list(joints), before.squares - after.squares
+    wanted = after.wanted[:, places].sum(1)
     drop, had = moving.sum(0), np.maximum(before.squares[1].sum(0), 1e-300)
     return Fall(
         own=float(drop[places].sum() / had[places].sum()),
-        chance=_by_chance(after.wanted[:, places].sum(1)),
+        chance=_by_chance(wanted),
         each=float((drop / had).sum()),
         whole=float(rows.sum()),
         worse=_by_chance(-rows.sum(1)),
+        every=len(wanted) >= FEWEST and bool((wanted > 0).all()),
     )
 
 
@@ -241,12 +248,16 @@ def beside_all(
 
 
 def predicts_better(problem: Problem, before: Step, after: Step, joints: Sequence[int]) -> bool:
-    """Whether data kept out surely prefer one fit to another: by the squares of some joints, which count alike."""
+    """Whether data kept out surely prefer one fit to another: by the squares of some joints, which count alike.
+
+    Less than what any cause must gain is no preference, however sure: two laws that are the same to these torques, as a
+    rotor on a vertical axis of the base and the link that it drives, differ by what priors make of them.
+    """
     worse, better = weighted_squares(problem, before, after)
     places = list(joints)
     drop, had = (worse.squares - better.squares)[1][:, places], worse.squares[1][:, places].sum(0)
     gain = (drop / np.maximum(had, 1e-300)).sum(1)
-    return bool(gain.sum() > 0 and _by_chance(gain) < BY_CHANCE)
+    return bool(gain.sum() > GAIN * len(places) and _by_chance(gain) < BY_CHANCE)
 
 
 def foretells(problem: Problem, bare: Step, full: Step, spectrum: Spectrum) -> bool:

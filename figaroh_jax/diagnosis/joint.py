@@ -18,7 +18,7 @@ from .design import fitted_fields, kind, shapes, with_shape
 from .estimates import Fitted, amplitude_places, torque_slopes, with_amplitudes
 from .problem import Problem, family_of
 from .state import State, assembled, solved
-from .step import Step, stand
+from .step import Step, stand, with_causes
 from .thresholds import NUMBER, SIZE_REGION
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def polished(
     A limit that a step has moved beyond all torques is nowhere and has no slope to come back by: where the last turn
     costs more than an earlier one, that one is the fit.
     """
-    joint = least = _together(problem, start, causes, whitening)
+    joint = least = _first(problem, start, causes, whitening)
     share, before = np.ones_like(joint.fitted.value), np.zeros_like(joint.fitted.value)
     for turn in range(0 if all(map(_settled, causes)) else turns):
         move = _move(joint)
@@ -80,6 +80,23 @@ def polished(
         if np.all(np.abs(joint.fitted.value - last.value) <= SETTLED * np.sqrt(np.diag(joint.fitted.covariance))):
             break
     return least if least.step.verdicts.cost < joint.step.verdicts.cost - WORSE else joint
+
+
+def _first(problem: Problem, start: State, causes: list[Effect], whitening: Float[np.ndarray, "F nv"]) -> Joint:
+    """All causes in one fit from the sizes that they have, or that all the others have without those that clip torque.
+
+    A drive at its limit clips the torque of all others. Where these are other ones than it was found beside, that may
+    be far beyond it anywhere: the rows that are left say little of them, and no turn leads back.
+    """
+    joint = _together(problem, start, causes, whitening)
+    free = [e for e in causes if not e.has("through")]
+    if len(free) == len(causes):
+        return joint
+    step = with_causes(problem, start, free, whitening)
+    sized, base = iter(with_amplitudes(step.state, free)), solved(start, step.state.theta[: len(start.theta)])
+    anew = [e if e.has("through") else exact(next(sized)) for e in causes]
+    other = _together(problem, base, anew, whitening)
+    return other if other.step.verdicts.cost < joint.step.verdicts.cost else joint
 
 
 def with_misfit(

@@ -54,6 +54,7 @@ __all__ = [
 
 NEAR, CLOSER = 4, 800  # times the level: p-values below which few draws cannot tell from it; draws that can
 BROKEN = 0.02  # of a cause's drop of the squares: where it keeps less of it than the rest, its shape is fitted on
+UNSETTLED = 1.02  # times the squares at the end of a search, beyond which its causes, all put in at once, are fitted on
 LATER = 150  # draws of the null once the first step has given the p-value that is reported
 
 
@@ -99,6 +100,7 @@ class Search(NamedTuple):
     p_value: float  # of the whole catalogue before anything was found
     p_left: float  # of the same once the causes were in
     shown: list[Shown]  # candidates, as the first screen saw them
+    blocks: Float[np.ndarray, " blocks"]  # held-out whitened squares with the causes in
 
 
 class Begun(NamedTuple):
@@ -174,7 +176,7 @@ def find_causes(
             screened = None
             found, step = _refreshed(problem, state, step, found, whitening, promised)
     begun = solved(with_width(problem, state), step.state.theta[: len(state.theta)])
-    return Search(problem, begun, found, p_values[0], p_values[-1], shown)
+    return Search(problem, begun, found, p_values[0], p_values[-1], shown, step.verdicts.blocks)
 
 
 def chance_beside(
@@ -205,8 +207,9 @@ def _refreshed(
     all shapes are fitted on.
     """
     begun = solved(with_width(problem, start), step.state.theta[: len(start.theta)])
-    causes = with_amplitudes(step.state, [f.effect for f in found])
-    step = with_causes(problem, begun, [exact(one) for one in causes], whitening)
+    causes = [exact(one) for one in with_amplitudes(step.state, [f.effect for f in found])]
+    found = [replace(f, effect=e) for f, e in zip(found, causes, strict=True)]
+    step = with_causes(problem, begun, causes, whitening)
     if step.verdicts.cost <= promised:
         return found, step
     base = solved(begun, step.state.theta[: len(start.theta)])
@@ -392,7 +395,7 @@ def eliminate(
     gone: list[tuple[Found, float]] = []
     if len(found) < 2:
         return found, gone
-    full = with_causes(problem, start, [f.effect for f in found], whitening, keep=True)
+    full = _all_in(problem, start, found, whitening)
     asked = list(found)
     while len(found) > 1:
         taken = [taken_beside(problem, start, full, found, one, whitening) for one in asked]
@@ -403,9 +406,22 @@ def eliminate(
         gone.append((asked[needless[0][1]], taken[needless[0][1]][0]))
         asked = [asked[k] for _, k in needless]
         found, asked = [f for f in found if f is not asked[0]], asked[1:]
-        full = with_causes(problem, start, [f.effect for f in found], whitening, keep=True)
+        full = _all_in(problem, start, found, whitening)
     problem.begun.clear()  # their columns are large
     return found, gone
+
+
+def _all_in(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> Step:
+    """All causes at once, as the search left them.
+
+    Drives at their limit clip the torque of all other causes, and find other rows to clip each time that is evaluated:
+    where one step leads away from where the search ended, they are fitted on from there.
+    """
+    full = with_causes(problem, start, [f.effect for f in found], whitening, keep=True)
+    if full.state.cut is None or full.verdicts.cost <= UNSETTLED * found[-1].cost[1]:
+        return full
+    settled = polished(problem, start, [f.effect for f in found], whitening).step
+    return settled if settled.verdicts.cost < full.verdicts.cost else full
 
 
 def taken_beside(
