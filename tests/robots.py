@@ -263,7 +263,8 @@ def _quadruped() -> str:
 
 
 MIXED = {"pendulum": PENDULUM, "plane": PLANE, "beast": BEAST, "quadruped": _quadruped()}
-_FOLDER = Path(tempfile.mkdtemp(prefix="figaroh_jax_robots_"))
+_HELD = tempfile.TemporaryDirectory(prefix="figaroh_jax_robots_")  # gone at the end
+_FOLDER = Path(_HELD.name)
 
 
 def write(name: str) -> Path:

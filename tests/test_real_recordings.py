@@ -188,3 +188,10 @@ def test_a_drive_s_limit_is_not_lost_as_all_causes_are_put_in_at_once(data_dir: 
     assert tuple(truth["at"]) == ("lwr_5_joint",)
     (limit,) = [c for c in found.causes if c.name == Name("torque_saturation", ("lwr_5_joint",))]
     assert limit.parameters["limit"].value == pytest.approx(truth["parameters"]["limit"], rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_coupling_of_inertia_alone_is_no_stand_in_for_a_tilt(data_dir: Path, tmp_path: Path) -> None:
+    """Its inertia was surely there, its damping and friction were below zero."""
+    found, _ = hidden_in(tmp_path, "panda", "gravity_tilt", 1009121, forbid=True)
+    assert "coupled_transmission" not in [cause.name.effect for cause in found.causes]

@@ -19,6 +19,7 @@ from figaroh_jax.diagnosis.naming import (
     _turns_against_itself,
     behind_joints,
     beside_rest,
+    lone_part,
     of_its_own,
     reason_against,
     stands_alone,
@@ -279,6 +280,25 @@ RIGHT = Standing(
 def test_beside_a_rest_a_cause_is_named_by_what_it_alone_explains(changes: dict[str, float], word: str) -> None:
     reason = reason_against(replace(RIGHT, **changes), True, 0.01)
     assert word in reason and bool(word) == bool(reason)
+
+
+@pytest.mark.parametrize(
+    ("inertia", "damping", "friction", "alone"),
+    [
+        (0.63, 0.08, -0.05, True),  # a rotor at the second joint
+        (0.63, -0.7, -0.4, True),
+        (0.63, 0.5, 0.0, False),  # likely damping
+        (0.3, 0.1, 0.0, False),  # no part is surely there: what they do together may be
+        (-0.7, 0.1, 0.2, False),
+    ],
+)
+def test_a_coupling_is_none_by_its_inertia_alone(inertia: float, damping: float, friction: float, alone: bool) -> None:
+    """Deviations are .25 each, of the answer's own intervals."""
+    effect = find("coupled_transmission")(np.array([1, 2]), inertia, damping, friction, np.float64(1.0))
+    fitted = SimpleNamespace(covariance=0.0625 * np.eye(7))
+    fitted.places = [(3, 4, 5)]
+    joint = cast(Any, SimpleNamespace(causes=[effect], fitted=fitted))
+    assert lone_part(joint) == (0 if alone else None)
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,7 @@ from .holdout import residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_rest, without_a_number
 from .judgement import KeptOut, Left, Searched, as_slow_noise, doubted_rest, reasons_against, standings_of, sticks_alone
 from .layout import describe_folds, repeats_not_said
-from .naming import LIKE_A_REST, beyond_simpler, strong
+from .naming import LIKE_A_REST, ONE_PART, beyond_simpler, lone_part, strong
 from .reading import Reader, only_read
 from .rest import (
     beyond_noise,
@@ -452,6 +452,8 @@ def _answered(
             why = f"{_UNSURE}: {_told_size(moving, least, here)}"
         elif (least := without_a_number(gaining.joint)) is not None:
             why = "none of its ten numbers is surely there"
+        elif searched.strict and (least := lone_part(gaining.joint)) is not None:
+            why = ONE_PART
         elif (least := _as_links(named, gaining.joint)) is not None:
             why = (
                 "beside it the links would move further than believed, which no cause explains: it may be part of that"

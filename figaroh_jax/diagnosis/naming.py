@@ -41,6 +41,7 @@ from .thresholds import (
     GAIN_NAMED,
     GAIN_NAMED_ROBOT,
     LAW_LEAVES,
+    LIKELY,
     MARGIN,
     MASS,
     MODULATION,
@@ -56,11 +57,13 @@ from .thresholds import (
 
 __all__ = [
     "LIKE_A_REST",
+    "ONE_PART",
     "Standing",
     "behind_joints",
     "beside_rest",
     "beyond_simpler",
     "cause_torque",
+    "lone_part",
     "of_its_own",
     "reason_against",
     "standings",
@@ -108,6 +111,7 @@ class Standing:
 
 
 LIKE_A_REST = "the unexplained residual may imitate it: it is named only where nothing else is left"
+ONE_PART = "of its inertia, damping and friction no more than one is surely there, as where it stands for another law"
 _VARIES = "its amplitude varies with position, speed, load or time (that would add"
 
 
@@ -187,10 +191,7 @@ def _of_those_beside_rest(
     yield (not one.cancels, "it cancels most of the joint's torque, as no gain beside another cause does")
     yield (one.beside_smooth > BESIDE_SMOOTH, "smooth functions of each joint's motion explain as much")
     yield (one.beside_rest or not rest or one.name in fading, LIKE_A_REST)
-    yield (
-        not one.one_part,
-        "of its inertia, damping and friction no more than one is surely there, as where it stands for another law",
-    )
+    yield (not one.one_part, ONE_PART)
     yield (
         not one.contested,
         "another law of the whole robot takes much beside it, with a sign that is physically impossible: what both"
@@ -565,6 +566,20 @@ def _one_part(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
     """
     deviations = _deviations(effect, fitted, place)
     return sum(abs(deviations[n]) >= COUPLED for n in effect.one_rotor) < 2
+
+
+def lone_part(joint: Joint) -> int | None:
+    """The first of the couplings of which one part is surely there by the answer's own intervals, and no other likely.
+
+    The law of a rotor at one of the joints, or of a tilt, is such a coupling's inertia; its damping and friction are
+    then chance, of either sign.
+    """
+    for k, (effect, place) in enumerate(zip(joint.causes, joint.fitted.places, strict=True)):
+        each = _deviations(effect, joint.fitted, place)
+        parts = sorted(each[n] for n in effect.one_rotor)
+        if parts and parts[-1] >= COUPLED and parts[-2] < LIKELY:
+            return k
+    return None
 
 
 def _spoils(before: Float[np.ndarray, "ways nv blocks"], after: Float[np.ndarray, "ways nv blocks"]) -> bool:

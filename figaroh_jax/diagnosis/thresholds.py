@@ -72,6 +72,7 @@ SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
 WEIGHTLESS = 2.0  # standard deviations below zero of what a link weighs with its cause: above, the cause is none
 TURNED_DOWN = 0.05  # of its largest: what friction that a law bends may have lost at the joint's top speed
 COUPLED = 2.0  # standard deviations of a part of a coupling (inertia, damping, friction), of which two must be there
+LIKELY = 1.0  # of one of them, where another is surely there by the answer's own intervals: below, it is chance
 NUMBER = 3.0  # standard deviations of a link's or a body's ten numbers, of which one must be there
 MASS = 3.0  # standard deviations of a body's mass: below, what moves is the link that carries it
 BESIDE_SMOOTH = 0.05  # gain of a cause of the whole robot beside smooth functions at every joint, or in their place
