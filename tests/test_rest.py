@@ -294,7 +294,8 @@ def test_beside_a_rest_a_cause_is_named_by_what_it_alone_explains(changes: dict[
 )
 def test_a_coupling_is_none_by_its_inertia_alone(inertia: float, damping: float, friction: float, alone: bool) -> None:
     """Deviations are .25 each, of the answer's own intervals."""
-    effect = find("coupled_transmission")(np.array([1, 2]), inertia, damping, friction, np.float64(1.0))
+    values = {"inertia": inertia, "damping": damping, "friction": friction, "sign": 1.0}
+    effect = find("coupled_transmission")(np.array([1, 2]), **{k: np.float64(x) for k, x in values.items()})
     fitted = SimpleNamespace(covariance=0.0625 * np.eye(7))
     fitted.places = [(3, 4, 5)]
     joint = cast(Any, SimpleNamespace(causes=[effect], fitted=fitted))
