@@ -450,6 +450,8 @@ def _answered(
         first, moving = named, as_weighed_in_motion(searched.here, by_speed) if named else by_speed
         if (least := least_sure(moving)) is not None:
             why = f"{_UNSURE}: {_told_size(moving, least, here)}"
+        elif not searched.strict and (least := least_sure(gaining.joint)) is not None:  # a rest widens what is told
+            why = f"{_UNSURE}: {_told_size(gaining.joint, least, here)}"
         elif (least := without_a_number(gaining.joint)) is not None:
             why = "none of its ten numbers is surely there"
         elif searched.strict and (least := lone_part(gaining.joint)) is not None:
