@@ -72,6 +72,8 @@ if TYPE_CHECKING:
 
 __all__ = ["diagnose", "diagnose_task"]
 
+NEARLY = 1.03  # times the held-out squares of a search, up to which it is worth another one from other causes
+
 
 def diagnose_task(
     task: Task, progress: Callable[[str, float], None] = lambda phase, share: None, backend: str = "native"
@@ -214,17 +216,27 @@ def _searched(
     others = [f for f in search.found if f not in left_out]
     p_value, shown = search.p_value, search.shown
     del search
-    ends = []
-    for begun in (kept + fading, others) if len(others) > len(kept + fading) else (others,):
+
+    def anew(begun: list[Found]) -> Search:
         give_back_holes()
-        about = Begun(begun, p_value, shown)
-        ends.append(find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, about))
-    search = ends[-1] if t_value(ends[0].blocks, ends[-1].blocks) > T_BETTER else ends[0]
-    del ends
+        return find_causes(*here[:4], [*forbid, *like_a_rest], alpha, progress, generator, Begun(begun, p_value, shown))
+
+    search = anew(kept + fading)
+    if len(others) > len(kept + fading) and _comes_near(here, others, search):
+        other = anew(others)
+        search = other if t_value(search.blocks, other.blocks) > T_BETTER else search
+        del other
     give_back_holes()
     last = ended(here, search)
     gone = (*last.gone, *(Nearest(f.name, f.share, LIKE_A_REST) for f in left_out))
     return last._replace(gone=gone, fading=tuple(f.name for f in fading))
+
+
+def _comes_near(here: Setting, found: list[Found], search: Search) -> bool:
+    """Whether some causes alone nearly predict what is left out as well as those that a search has ended with."""
+    problem, start, _, whitening = here[:4]
+    step = with_causes(problem, start, [f.effect for f in found], whitening)
+    return step.verdicts.heldout < NEARLY * float(search.blocks.sum())
 
 
 def _borne_out(here: Setting, before: list[Found], one: Found) -> bool:
