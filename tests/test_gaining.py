@@ -216,7 +216,7 @@ def test_of_two_laws_the_one_that_surely_predicts_their_joints_better_is_preferr
     rng = np.random.default_rng(14)
     first = squares(rng, 1.0, 1.0)
     second = first * np.array([0.6, 1.8]) * (1 + 0.1 * rng.standard_normal(first.shape))
-    monkeypatch.setattr(gaining, "weighted_squares", lambda problem, before, after: in_turn(before, after))
+    monkeypatch.setattr(gaining, "weighted_of_errors", lambda problem, before, after: in_turn(before, after))
     problem, one, other = (cast(Any, x) for x in (None, first, second))
     assert predicts_better(problem, one, other, [0])
     assert not predicts_better(problem, one, other, [1])

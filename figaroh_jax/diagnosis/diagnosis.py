@@ -39,7 +39,7 @@ from .flexible import families, flexible_p
 from .floor import foretold, noise_rms, short, sober_spectrum, undecided
 from .gaining import Gaining, beside_all, predicts_better, without_losses
 from .gates import physical_sign
-from .holdout import residual_rms, traces
+from .holdout import kept_out_error, residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_rest, without_a_number
 from .judgement import KeptOut, Left, Searched, as_slow_noise, doubted_rest, reasons_against, standings_of, sticks_alone
 from .layout import describe_folds, repeats_not_said
@@ -184,6 +184,7 @@ def _searched(
         progress("fitting all causes together", 0.8)
         found, joint, gone = _fitted_together(here, search.found, forbid, tolerance)
         found, joint = _told_apart(here, found, joint)
+        give_back_holes()
         left = _left(here, search, found, joint, forbid, tolerance, generator)
         strict = left.rest.there or left.excess > NO_REST or len(found) > FEW_CAUSES
         if not strict and (kept := _possible(found, joint)) != found:
@@ -281,10 +282,9 @@ def _told_apart(here: Setting, found: list[Found], joint: Joint) -> tuple[list[F
             if not physical_sign(other.effect) or other.name in [f.name for f in found]:
                 continue
             both = sorted({*one.joints} & {*other.joints})
-            own, instead = (
-                with_causes(problem, start, [x if at == k else e for at, e in enumerate(joint.causes)], whitening)
-                for x in (joint.causes[k], other.effect)
-            )  # both in one step from the same start, which leaves all that they share alike
+            fits = ([x if at == k else e for at, e in enumerate(joint.causes)] for x in (joint.causes[k], other.effect))
+            # both in one step from the same start, which leaves all that they share alike
+            own, instead = (kept_out_error(problem, with_causes(problem, start, one, whitening)) for one in fits)
             if predicts_better(problem, own, instead, both):
                 new = one.as_another(other, (one.name, *one.ambiguous))
                 found = [new if f is found[k] else f for f in found]

@@ -14,7 +14,7 @@ from ..effects.base import Effect
 from ..estimation.noise import Spectrum, whitening
 from ..estimation.rows import Prior
 from ..results import Gain, Name
-from .holdout import Held, held_squares, weighted_squares, whitened_wanted
+from .holdout import Held, held_squares, weighted_of_errors, weighted_squares, whitened_wanted
 from .joint import Joint, polished
 from .problem import Problem
 from .search import Found, stood_without
@@ -247,13 +247,17 @@ def beside_all(
     return fall(*weighted_squares(problem, bare, full), one.joints)
 
 
-def predicts_better(problem: Problem, before: Step, after: Step, joints: Sequence[int]) -> bool:
+def predicts_better(
+    problem: Problem, before: Float[np.ndarray, "n M nv"], after: Float[np.ndarray, "n M nv"], joints: Sequence[int]
+) -> bool:
     """Whether data kept out surely prefer one fit to another: by the squares of some joints, which count alike.
+
+    `before` and `after` are the fits' errors there (`kept_out_error`): two whole fits would take twice the memory.
 
     Less than what any cause must gain is no preference, however sure: two laws that are the same to these torques, as a
     rotor on a vertical axis of the base and the link that it drives, differ by what priors make of them.
     """
-    worse, better = weighted_squares(problem, before, after)
+    worse, better = weighted_of_errors(problem, before, after)
     places = list(joints)
     drop, had = (worse.squares - better.squares)[1][:, places], worse.squares[1][:, places].sum(0)
     gain = (drop / np.maximum(had, 1e-300)).sum(1)

@@ -27,10 +27,12 @@ __all__ = [
     "fold_error",
     "fold_squares",
     "held_squares",
+    "kept_out_error",
     "part_error",
     "predicted",
     "residual_rms",
     "traces",
+    "weighted_of_errors",
     "weighted_rms",
     "weighted_squares",
     "whitened_wanted",
@@ -61,7 +63,7 @@ def held_squares(
     for effect in [None, *causes]:
         grown = start if step is None or effect is None else extended_state(problem, step.state, effect)
         step = stand(problem, grown, whitening, step)
-        error = _error(problem, step)
+        error = kept_out_error(problem, step)
         out.append(_held(problem, error if before is None else before, error, moves))
         before = error
     rows = np.stack([np.ones(kept.shape), moves])
@@ -70,7 +72,14 @@ def held_squares(
 
 def weighted_squares(problem: Problem, bare: Step, full: Step) -> tuple[Held, Held]:
     """As `held_squares` of a fit without and with a cause; the rows that say how a joint moves by their weights."""
-    before, after, weight = _error(problem, bare), _error(problem, full), _by_speed(problem)
+    return weighted_of_errors(problem, kept_out_error(problem, bare), kept_out_error(problem, full))
+
+
+def weighted_of_errors(
+    problem: Problem, before: Float[np.ndarray, "n M nv"], after: Float[np.ndarray, "n M nv"]
+) -> tuple[Held, Held]:
+    """`weighted_squares` of the errors of two fits, `kept_out_error`."""
+    weight = _by_speed(problem)
     return _held(problem, before, before, weight), _held(problem, before, after, weight)
 
 
@@ -142,7 +151,7 @@ def _moves(problem: Problem) -> Float[np.ndarray, "n M nv"]:
     return np.where(seldom, 1.0, moves)
 
 
-def _error(problem: Problem, step: Step) -> Float[np.ndarray, "n M nv"]:
+def kept_out_error(problem: Problem, step: Step) -> Float[np.ndarray, "n M nv"]:
     """Each joint's error (N m or N) on data not fitted, zero in other rows."""
     state, part = step.state, problem.layout.part
     if problem.held.any():

@@ -406,8 +406,11 @@ def eliminate(
         gone.append((asked[needless[0][1]], taken[needless[0][1]][0]))
         asked = [asked[k] for _, k in needless]
         found, asked = [f for f in found if f is not asked[0]], asked[1:]
+        del full  # its rows and columns are large
         full = _all_in(problem, start, found, whitening)
-    problem.begun.clear()  # their columns are large
+    problem.begun.clear()  # and so are theirs
+    del full
+    give_back_holes()
     return found, gone
 
 
