@@ -23,7 +23,7 @@ from .fit import Fit, fit, spread_of_recordings
 from .gates import Slight, checked, gained, in_order, needless, replaced, rms_of, standing, still_needed, worthy
 from .parameters import put, values
 from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_of_entry, outputs, sprung_now, tried_now
-from .search import Model, Named, Search, Tried, judged_by_colour, sized, t_of
+from .search import Model, Named, Search, Tried, all_but, judged_by_colour, sized, t_of
 from .sensitivity import predicted
 from .setting import Setting, Structure, begins_of, begun, by_recording, evened, free_entries, level_of, thinned
 from .shared import at_all_joints
@@ -153,8 +153,8 @@ def _searched(
     doubtful = list[tuple[Name, float, str]]()
     while slight is None and (less := _of_sure_size(here, now, found, spread, even, forbid)) is not None:
         gone, found, now, spread = less
-        doubtful.append(gone)
-        steps.append((f"without {gone[0]}", _level(here, now.model.fit)))
+        doubtful += gone
+        steps.append((f"without {', '.join(str(one[0]) for one in gone)}", _level(here, now.model.fit)))
         held.append(rms_of(here, now.held))
     result = Search(
         "nothing", found, now.model.structure, first, now.model.fit, p_value, [], nearest, steps, held, fits,
@@ -165,17 +165,19 @@ def _searched(
 
 def _of_sure_size(
     here: Setting, now: Standing, found: list[Named], spread: np.ndarray | None, even: bool, forbid: Sequence[str]
-) -> tuple[tuple[Name, float, str], list[Named], Standing, np.ndarray | None] | None:
-    """What is told of the least sure cause whose told interval holds no effect, and the model without it; else None."""
+) -> tuple[list[tuple[Name, float, str]], list[Named], Standing, np.ndarray | None] | None:
+    """What is told of the least sure cause whose told interval holds no effect, and the model without it; else None.
+
+    With it go those of other joints that have its numbers.
+    """
     if _verdict(here, now, found) not in ("named", "named+rest"):
         return None
     gone = least_sure([n.candidate for n in found], now.model.structure, now.model.fit, spread)
     if gone is None:
         return None
-    (one,) = (n for n in found if n.candidate is gone)
-    why = why_nothing(gone, now.model.structure, now.model.fit, spread)
-    told = Name(gone.effect, gone.at), max(one.gain, 0.0), why
-    return told, *_without(here, now, [n for n in found if n is not one], gone, even, forbid)
+    why, kept = why_nothing(gone, now.model.structure, now.model.fit, spread), all_but(found, gone)
+    told = [(Name(n.candidate.effect, n.candidate.at), max(n.gain, 0.0), why) for n in found if n not in kept]
+    return told, *_without(here, now, kept, gone, even, forbid)
 
 
 def _without(

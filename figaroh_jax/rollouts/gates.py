@@ -11,7 +11,7 @@ from .fit import Fit, System, fit, refitted_without
 from .loop import alike
 from .parameters import values
 from .screening import LATE, ROUGH, Standing, excess_of, joint_of, outputs
-from .search import Model, Named, Tried, sized, t_of, t_of_places, t_of_recordings
+from .search import Model, Named, Tried, all_but, sized, t_of, t_of_places, t_of_recordings
 from .setting import Setting, Structure, by_recording
 from .thresholds import (
     CONFIDENT,
@@ -187,7 +187,7 @@ def still_needed(
         if spare is None:
             break
         new = standing(here, now.model.structure, *_without(here, now, spare.candidate.entries))
-        rest = [n for n in found if n.candidate is not spare.candidate]
+        rest = all_but(found, spare.candidate)
         if not new.excess.max() < 1.0:
             j = joint_of(here, spare.candidate)
             mine = slice(None) if j < 0 else slice(j, j + 1)

@@ -7,7 +7,7 @@ drive or a link, or several of them that share one number.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -29,6 +29,7 @@ __all__ = [
     "Entry",
     "Table",
     "current",
+    "of_one_number",
     "put",
     "uncoupled",
     "unit_of",
@@ -53,6 +54,20 @@ class Entry(NamedTuple):
 
 
 Table = tuple[Entry, ...]
+
+
+def of_one_number(table: Table, alike: Sequence[tuple[int, ...]]) -> Table:
+    """The table with one number where `alike` are several: the first has the places of all, the others have none.
+
+    Each of `alike` are the entries of one place, in the same order of names.
+    """
+    new = list(table)
+    for first, *others in zip(*alike, strict=True):
+        new[first] = table[first]._replace(at=tuple(at for k in (first, *others) for at in table[k].at))
+        for k in others:
+            new[k] = table[k]._replace(at=())
+    return tuple(new)
+
 
 TEN = ("mass", "mass_x", "mass_y", "mass_z",
        "inertia_xx", "inertia_xy", "inertia_yy", "inertia_xz", "inertia_yz", "inertia_zz")  # fmt: skip
@@ -105,8 +120,11 @@ def unit_of(loop: Loop, entry: Entry) -> str:
 
 
 def values(loop: Loop, table: Table) -> np.ndarray:
-    """The numbers of the table in a loop (a payload is 0, as are those of `TEN`: they are what is added)."""
-    return np.array([float(_get(loop, entry.name)[entry.at[0]]) for entry in table])
+    """The numbers of the table in a loop (a payload is 0, as are those of `TEN`: they are what is added).
+
+    NaN where an entry has no place (`of_one_number`).
+    """
+    return np.array([float(_get(loop, entry.name)[entry.at[0]]) if entry.at else np.nan for entry in table])
 
 
 def current(loop: Loop, table: Table) -> Array:

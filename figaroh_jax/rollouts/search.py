@@ -54,6 +54,7 @@ __all__ = [
     "Named",
     "Search",
     "Tried",
+    "all_but",
     "judged_by_colour",
     "scored",
     "search",
@@ -82,6 +83,11 @@ class Named(NamedTuple):
     alike: tuple[Name, ...]
     before: float = float("nan")  # held-out RMS, rad or m
     after: float = float("nan")
+
+
+def all_but(found: Sequence[Named], gone: Candidate) -> list[Named]:
+    """The causes but one, and but those that have its numbers: joints of one kind of drive have one together."""
+    return [n for n in found if (n.candidate.effect, n.candidate.entries) != (gone.effect, gone.entries)]
 
 
 @dataclass
@@ -550,7 +556,7 @@ def sized(here: Setting, one: Tried) -> bool:
         return False
     if kind.falls_off is not None:  # beyond every speed it is plain friction
         speed = one.candidate.entries[kind.falls_off]
-        if found.theta[speed] > _top_speed(here, one.state.structure.table[speed].at[0]):
+        if found.theta[speed] > max(_top_speed(here, j) for j in one.state.structure.table[speed].at):
             return False
     if not shown(here, one.candidate, found.theta):
         return False

@@ -4,23 +4,28 @@ Joints driven by one kind of servo have the same kinds of friction and rotor. Be
 cause at one joint must be large, for a smaller one may make up for what is missing. One that surely lowers what each of
 three encoders or more shows need not be, where nearly all recordings that were not fitted bear all of them out; joints
 that show less of it have it too then.
+
+Each joint first has numbers of its own. Where these are not borne out, joints whose drives the file has alike have one
+number together: a servo's own parts are the same wherever it stands, and one number is told by all of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from .causes import Candidate
 from .fit import Fit, fit
 from .gates import rms_of, standing
+from .parameters import of_one_number, values
 from .screening import LATE, ROUGH, Standing, joint_of
 from .search import Named, Tried, sized, t_of_recordings
-from .setting import Setting, by_recording, free_entries, start_values
+from .setting import Setting, Structure, by_recording, free_entries, start_values
 from .thresholds import CONFIDENT, FEWEST_JOINTS, GAIN, HOPEFUL, T_BESIDE_REST
 
-__all__ = ["at_all_joints"]
+__all__ = ["at_all_joints", "of_one_kind"]
 
 _PART = 1 / 3  # of what it adds to, from which its fit starts
 _EARLY, _SOON = 4, 0.5  # steps from each start, and the share of what is to be gained that is seen by then
@@ -31,14 +36,15 @@ def at_all_joints(here: Setting, now: Standing, found: Sequence[Named]) -> tuple
     model = now.model
     if not by_recording(here) or model.structure.loop.robot.nv != here.loop.robot.nv:
         return [], now
-    for ones in _families(here, now, found):
-        fits = [_early(here, now, ones, theta) for theta in _starts(here, now, ones)]
-        best = min(fits, key=lambda one: one.cost)
-        own = now.squares[..., [joint_of(here, c) for c in ones]].sum()
-        if now.model.fit.cost - best.cost > _SOON * HOPEFUL * own:
-            named, new = _borne_out(here, now, ones, best)
-            if named:
-                return named, new
+    families = _families(here, now, found)
+    for ones in families:
+        named, new = _borne_out(here, now, ones)
+        if named:
+            return named, new
+    for ones in (kind for family in families for kind in of_one_kind(here, family)):
+        named, new = _as_one_number(here, now, ones)
+        if named:
+            return named, new
     return [], now
 
 
@@ -48,10 +54,33 @@ def _families(here: Setting, now: Standing, found: Sequence[Named]) -> list[list
     families: dict[str, list[Candidate]] = {}
     for c in here.known.candidates:
         open_still = (c.effect, c.at) not in used and not set(c.entries) <= set(now.model.free)
-        shared = (c.kind.usual or c.kind.adds_to) and not c.kind.several
+        less = _less(here, c)
+        beside = c.kind.adds_to and (less is None or set(less.entries) <= set(now.model.free))
+        shared = (c.kind.usual or beside) and not c.kind.several
         if shared and open_still and now.excess[joint_of(here, c)] >= 1.0:
             families.setdefault(c.effect, []).append(c)
     return [ones for ones in families.values() if len(ones) >= FEWEST_JOINTS]
+
+
+def _less(here: Setting, c: Candidate) -> Candidate | None:
+    """What a cause is more of, at its place, where the baseline does not have it: it is found beside that alone."""
+    return next((x for x in here.known.candidates if (x.effect, x.at) == (c.kind.adds_to, c.at)), None)
+
+
+def of_one_kind(here: Setting, ones: Sequence[Candidate]) -> list[list[Candidate]]:
+    """Those of a family at joints that the file has alike: the same drive, which moves that joint alone, and the same
+    numbers of it."""
+    drives, kinds = here.loop.drives, dict[tuple, list[Candidate]]()
+    gear = np.abs(np.asarray(drives.transmission))
+    stated = values(here.loop, here.known.table)
+    for c in ones:
+        mine = np.flatnonzero(gear[:, joint_of(here, c)])
+        if len(mine) != 1 or np.count_nonzero(gear[mine[0]]) != 1:
+            continue
+        own = (gear[mine[0]].max(), *(np.asarray(x)[mine[0]] for x in (drives.gain, drives.bias, drives.force_range)))
+        told = np.concatenate([np.ravel(x) for x in (*own, stated[list(c.entries)])])
+        kinds.setdefault(tuple(float(f"{x:.6g}") for x in told), []).append(c)
+    return [alike for alike in kinds.values() if len(alike) >= FEWEST_JOINTS]
 
 
 def _starts(here: Setting, now: Standing, ones: Sequence[Candidate]) -> list[np.ndarray]:
@@ -61,56 +90,114 @@ def _starts(here: Setting, now: Standing, ones: Sequence[Candidate]) -> list[np.
         theta = now.model.fit.theta.copy()
         for c in ones:
             theta = start_values(theta, c, c.starts[variant % len(c.starts)])
-            less = next((x for x in here.known.candidates if (x.effect, x.at) == (c.kind.adds_to, c.at)), None)
-            if less is not None:
+            if (less := _less(here, c)) is not None:
                 theta[c.entries[0]] = _PART * theta[less.entries[0]]
                 theta[less.entries[0]] *= 1 - _PART / 2
         found.append(theta)
     return found
 
 
-def _early(here: Setting, now: Standing, ones: Sequence[Candidate], theta: np.ndarray) -> Fit:
-    """A few steps of a family from one start."""
-    return _fit(here, now, ones, theta, now.model.fit.start, _EARLY)[0]
+def _best_early(
+    here: Setting, now: Standing, structure: Structure, ones: Sequence[Candidate], starts: Sequence[np.ndarray]
+) -> Fit | None:
+    """The best of a family after a few steps from each start, where it may gain enough."""
+    fits = [_fit(here, now, structure, ones, theta, now.model.fit.start, _EARLY)[0] for theta in starts]
+    best = min(fits, key=lambda one: one.cost)
+    own = now.squares[..., [joint_of(here, c) for c in ones]].sum()
+    return best if now.model.fit.cost - best.cost > _SOON * HOPEFUL * own else None
 
 
 def _fit(
-    here: Setting, now: Standing, ones: Sequence[Candidate], theta: np.ndarray, start: np.ndarray, most: int
+    here: Setting,
+    now: Standing,
+    structure: Structure,
+    ones: Sequence[Candidate],
+    theta: np.ndarray,
+    start: np.ndarray,
+    most: int,
 ) -> tuple[Fit, list[int]]:
     free = free_entries(now.model.free, [k for c in ones for k in c.entries])
-    return fit(*now.model.structure, theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
+    return fit(*structure, theta[None], [free], start[None], width=max(here.width, len(free)), lanes=1,
                iterations=most, rough=ROUGH)[0], free  # fmt: skip
 
 
-def _borne_out(here: Setting, now: Standing, ones: Sequence[Candidate], begin: Fit) -> tuple[list[Named], Standing]:
-    """The members of a family that held-out recordings bear out, each and together."""
-    runs, before = np.array([x.run for x in here.stretches]), now.held
-    for _ in range(2):
+def _borne_out(here: Setting, now: Standing, ones: Sequence[Candidate]) -> tuple[list[Named], Standing]:
+    """The members of a family that held-out recordings bear out, each with numbers of its own, and together."""
+    structure = now.model.structure
+    begin = _best_early(here, now, structure, ones, _starts(here, now, ones))
+    for _ in range(2 if begin is not None else 0):
+        assert begin is not None
         theta = begin.theta.copy()
         for k in [k for k in begin.free if k >= 0 and k not in now.model.free]:
             if all(k not in c.entries for c in ones):
                 theta[k] = now.model.fit.theta[k]
-        one, free = _fit(here, now, ones, theta, begin.start, LATE)
-        new = standing(here, now.model.structure, one, free)
-        gains, ts = {}, {}
-        for c in ones:
-            j = joint_of(here, c)
-            gains[c] = min(1 - x[..., j].sum() / max(y[..., j].sum(), 1e-300)
-                           for x, y in ((new.held, before), (new.squares, now.squares)))  # fmt: skip
-            ts[c] = t_of_recordings(before[..., j], new.held[..., j], runs)
-        good = [c for c in ones if gains[c] > GAIN and ts[c] > 0 and sized(here, Tried(c, new.model, new.squares))]
-        if sum(ts[c] > CONFIDENT for c in good) < FEWEST_JOINTS:
-            return [], now
+        new, told = _judged(here, now, structure, ones, begin._replace(theta=theta))
+        good = [c for c in ones if told[c].good]
         if len(good) == len(ones):
-            break
+            return _together(here, now, new, told)
+        if sum(told[c].t > CONFIDENT for c in good) < FEWEST_JOINTS:
+            return [], now
         ones = good
-    else:
+    return [], now
+
+
+def _as_one_number(here: Setting, now: Standing, ones: Sequence[Candidate]) -> tuple[list[Named], Standing]:
+    """The members of a family that held-out recordings bear out with one number together, the worst left out first."""
+    ones = list(ones)
+    while len(ones) >= FEWEST_JOINTS:
+        table = of_one_number(now.model.structure.table, [c.entries for c in ones])
+        structure, first = now.model.structure._replace(table=table), ones[0].entries
+        starts = _starts(here, now, ones)
+        for theta in starts:
+            theta[list(first)] = np.mean([theta[list(c.entries)] for c in ones], axis=0)
+        alike = [c._replace(entries=first) for c in ones]
+        begin = _best_early(here, now, structure, alike, starts)
+        if begin is None:
+            return [], now
+        new, told = _judged(here, now, structure, alike, begin)
+        bad = [k for k, c in enumerate(alike) if not told[c].good]
+        if not bad:
+            return _together(here, now, new, told)
+        del ones[min(bad, key=lambda k: told[alike[k]].gain)]
+    return [], now
+
+
+class _Told(NamedTuple):
+    """What recordings that were not fitted say of one member of a family."""
+
+    gain: float  # share of the squares of its joint, no more than on those that were fitted
+    t: float
+    good: bool
+
+
+def _judged(
+    here: Setting, now: Standing, structure: Structure, ones: Sequence[Candidate], begin: Fit
+) -> tuple[Standing, dict[Candidate, _Told]]:
+    """The model with a family, fitted to the end, and what it is worth at each joint."""
+    new = standing(here, structure, *_fit(here, now, structure, ones, begin.theta, begin.start, LATE))
+    runs, told = np.array([x.run for x in here.stretches]), dict[Candidate, _Told]()
+    for c in ones:
+        j = joint_of(here, c)
+        gain = min(1 - x[..., j].sum() / max(y[..., j].sum(), 1e-300)
+                   for x, y in ((new.held, now.held), (new.squares, now.squares)))  # fmt: skip
+        t = t_of_recordings(now.held[..., j], new.held[..., j], runs)
+        told[c] = _Told(gain, t, gain > GAIN and t > 0 and sized(here, Tried(c, new.model, new.squares)))
+    return new, told
+
+
+def _together(
+    here: Setting, now: Standing, new: Standing, told: dict[Candidate, _Told]
+) -> tuple[list[Named], Standing]:
+    """The members of a family, where three or more are sure and all together are; the largest gain first."""
+    runs, gains = np.array([x.run for x in here.stretches]), [one.gain for one in told.values()]
+    if sum(one.t > CONFIDENT for one in told.values()) < FEWEST_JOINTS or np.mean(gains) < HOPEFUL:
         return [], now
-    together = _t_together(before, new.held, runs, [joint_of(here, c) for c in ones])
-    if together < T_BESIDE_REST or np.mean(list(gains.values())) < HOPEFUL:
+    if _t_together(now.held, new.held, runs, [joint_of(here, c) for c in told]) < T_BESIDE_REST:
         return [], now
-    rms = [[rms_of(here, x, joint_of(here, c)) for x in (before, new.held)] for c in ones]
-    named = [Named(c, ts[c], gains[c], (), *x) for c, x in zip(ones, rms, strict=True)]
+    named = []
+    for c, one in told.items():
+        before, after = (rms_of(here, x, joint_of(here, c)) for x in (now.held, new.held))
+        named.append(Named(c, one.t, one.gain, (), before, after))
     return sorted(named, key=lambda n: n.after**2 - n.before**2), new
 
 
