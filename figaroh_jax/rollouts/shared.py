@@ -25,7 +25,7 @@ from .search import Named, Tried, sized, t_of_recordings
 from .setting import Setting, Structure, by_recording, free_entries, start_values
 from .thresholds import CONFIDENT, FEWEST_JOINTS, GAIN, HOPEFUL, T_BESIDE_REST
 
-__all__ = ["at_all_joints", "of_one_kind"]
+__all__ = ["as_one_number", "at_all_joints", "of_one_kind"]
 
 _PART = 1 / 3  # of what it adds to, from which its fit starts
 _EARLY, _SOON = 4, 0.5  # steps from each start, and the share of what is to be gained that is seen by then
@@ -42,7 +42,7 @@ def at_all_joints(here: Setting, now: Standing, found: Sequence[Named]) -> tuple
         if named:
             return named, new
     for ones in (kind for family in families for kind in of_one_kind(here, family)):
-        named, new = _as_one_number(here, now, ones)
+        named, new = as_one_number(here, now, ones)
         if named:
             return named, new
     return [], now
@@ -141,7 +141,7 @@ def _borne_out(here: Setting, now: Standing, ones: Sequence[Candidate]) -> tuple
     return [], now
 
 
-def _as_one_number(here: Setting, now: Standing, ones: Sequence[Candidate]) -> tuple[list[Named], Standing]:
+def as_one_number(here: Setting, now: Standing, ones: Sequence[Candidate]) -> tuple[list[Named], Standing]:
     """The members of a family that held-out recordings bear out with one number together, the worst left out first."""
     ones = list(ones)
     while len(ones) >= FEWEST_JOINTS:
