@@ -66,7 +66,7 @@ def main(source: str, target: str) -> None:
     height = TOP + ROW * len(JOINTS) + 34
     parts = [f'<text x="{LEFT - 12}" y="{TOP + 14 + ROW * k}" text-anchor="end" fill="{TEXT}">{name}</text>'
              for k, name in enumerate(JOINTS.values())]  # fmt: skip
-    parts += panel(LEFT, "Friction, N m", friction, FRICTION, (0.0, 0.65), log=False)
+    parts += panel(LEFT, "Sliding friction, N m", friction, FRICTION, (0.0, 0.65), log=False)
     parts += panel(LEFT + PANEL + 50, "Gain, N m/rad (logarithmic)", gain, GAIN, (5.0, 1100.0), log=True)
     parts.append(f'<text x="{LEFT}" y="{height - 6}" fill="{TEXT}" font-size="11">Dots and bars: what recordings of '
                  "one arm say, with 95 % intervals. Dashed: published.</text>")  # fmt: skip
