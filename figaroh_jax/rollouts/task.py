@@ -227,6 +227,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
             *_kinds_note(loop, gain),
             *colour_notes(here),
             *(_open_sizes(found) if named else ()),
+            *(_of_one_number(found) if named else ()),
             *(_taken_gains(task, found) if named else ()),
             *implausible(loop.robot, model, task.robot.trust),
             *_refitted_note(here, runs, refitted, found.verdict),
@@ -441,6 +442,19 @@ def _open_sizes(found: Search) -> list[str]:
                 f" predicted better with it; how large it is they do not tell (its 95 % interval reaches 0): {why}"
             )
     return told
+
+
+def _of_one_number(found: Search) -> list[str]:
+    """Which causes have one number together, and why."""
+    together: dict[tuple, list[str]] = {}
+    for one in found.named:
+        together.setdefault((one.candidate.effect, one.candidate.entries), []).append(", ".join(one.candidate.at))
+    return [
+        f"{effect} has one size at {', '.join(at)}: the model file gives them the same drive, and none of them shows"
+        " enough of it with a size of its own"
+        for (effect, _), at in together.items()
+        if len(at) > 1
+    ]
 
 
 def _taken_gains(task: Task, found: Search) -> list[str]:
