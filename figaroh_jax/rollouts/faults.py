@@ -83,15 +83,17 @@ def faults(loop: Loop, runs: Sequence[Run], simulated: Sequence[np.ndarray]) -> 
 def _together(loop: Loop, run: Run, read: np.ndarray, usual: np.ndarray) -> list[Fault]:
     """Stretches in which three joints or more stand, or nearly so, far from where the model has them, all at once.
 
-    Friction alone may hold each of them there, but not by chance all at the same time: something pushes the arm.
+    Friction alone may hold each of them there, but not by chance all at the same time: something pushes the arm. A
+    joint whose command has moved by less than it is off stands where it stood at first: that it is off says nothing.
     """
     period = regular(run.name, run.time)
     rows = max(1, round(_LONG / period))
     mean = lambda x: np.stack([np.convolve(c, np.ones(rows) / rows, mode="same") for c in x.T], 1)  # noqa: E731
     error = mean(run.position - read)
     slow = mean(np.abs(np.gradient(run.position, period, axis=0))) < _MOVING
-    far = slow & (np.abs(error) > _OFF * np.maximum(usual, 1e-12))
     drives, places = loop.drives, list(loop.measured)
+    asked = _asked(loop, run)[:, places]
+    far = slow & (np.abs(error) > _OFF * np.maximum(usual, 1e-12)) & (asked > np.abs(error))
     stiff = np.abs((np.asarray(drives.scale) * np.asarray(drives.bias)[:, 1]) @ np.asarray(drives.transmission) ** 2)
     found = []
     for first, last in _stretches(far.sum(1) >= _SEVERAL):
@@ -101,6 +103,18 @@ def _together(loop: Loop, run: Run, read: np.ndarray, usual: np.ndarray) -> list
             size = float(np.median((np.abs(error[part]) * stiff[places]).max(1)))
             found.append(Fault("contact", 0, float(run.time[first]), float(run.time[last]), joints, size))
     return found
+
+
+def _asked(loop: Loop, run: Run) -> np.ndarray:
+    """By how much the commands of each joint's drives have moved so far, (rows, nv); not that of drives of a torque."""
+    drives = loop.drives
+    follows = np.asarray(drives.bias)[:, 1] != 0
+    reach = np.maximum.accumulate(run.command) - np.minimum.accumulate(run.command)
+    ratio = np.asarray(drives.gain)[:, 0] / np.where(follows, -np.asarray(drives.bias)[:, 1], 1.0)
+    moved = np.where(follows, np.abs(ratio) * reach, np.inf)
+    way = np.abs(np.asarray(drives.transmission))
+    each = np.where(way > 0, moved[:, :, None] / np.where(way > 0, way, 1.0), 0.0)
+    return np.where((way > 0).any(0), each.max(1), np.inf)
 
 
 def without(runs: Sequence[Run], found: Sequence[Fault], margin: float = 0.5) -> tuple[Run, ...]:
