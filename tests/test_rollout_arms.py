@@ -87,14 +87,18 @@ def test_an_arm_that_rests_on_something_is_told_where_several_joints_stand_off_a
     command[400:600] = sound.position[400] + state.qfrc_bias / np.array(servo_arm6.KP)  # what gravity asks for
     sound = sound._replace(command=command)
     model = sound.position + 2e-3 * np.random.default_rng(1).normal(size=sound.position.shape)
-    found = {}
+    found: dict = {}
     for joints in ((1, 2), (1, 2, 3)):
         position = sound.position.copy()
         position[400:600] = position[400]
         read = np.where((np.arange(len(position)) // 200 == 2)[:, None], position, model)
         position[400:600, joints] += 0.012
         found[joints] = faults(loop, [sound, sound._replace(position=position)], [model, read])
-    assert found[1, 2] == []
+        still = command.copy()  # joints that are not moved in this recording stand where they stood at first
+        still[:, joints] = command[400, joints]
+        found["still", joints] = faults(loop, [sound, sound._replace(position=position, command=still)], [model, read])
+    assert found[1, 2] == found["still", (1, 2)] == []
+    assert [one for one in found["still", (1, 2, 3)] if len(one.joints) > 2] == []
     (one,) = found[1, 2, 3]
     assert (one.kind, one.run, one.joints) == ("contact", 1, (1, 2, 3))
     assert abs(one.first - 4.0) < 0.5 and abs(one.last - 6.0) < 0.5
