@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import browser
@@ -20,6 +21,7 @@ from figaroh_jax.reporting.rollout_report import show_rollouts, write_rollouts
 from figaroh_jax.results import Trace
 from figaroh_jax.rollouts.identification import RolloutIdentification
 from figaroh_jax.rollouts.rest import parts_of, relative_rest
+from figaroh_jax.rollouts.task import one_number_notes
 
 
 def trace(name: str, role: Any, rng: np.random.Generator) -> Trace:
@@ -125,3 +127,12 @@ def test_errors_of_joints_that_turn_and_slide_are_told_apart(tmp_path: Path):
     assert "rad or m" not in text and "Joints that turn" in text and "Joints that slide" in text
     assert "10 mrad" in text and "2 mm" in text
     assert "wrist_roll (on its bound)" in text and "wrist roll" not in text
+
+
+def test_the_answer_says_which_joints_have_one_number_together():
+    def named(at: str, entries: tuple[int, ...]) -> Any:
+        return SimpleNamespace(candidate=SimpleNamespace(effect="stribeck_friction", entries=entries, at=(at,)))
+
+    found: Any = SimpleNamespace(named=[named("pan", (1, 2)), named("lift", (1, 2)), named("jaw", (3, 4))])
+    (text,) = one_number_notes(found)
+    assert "one size at pan, lift:" in text

@@ -48,6 +48,7 @@ __all__ = [
     "diagnosis_setting",
     "diverged",
     "extended_of",
+    "one_number_notes",
     "read_rollouts",
     "simulated",
 ]
@@ -227,7 +228,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
             *_kinds_note(loop, gain),
             *colour_notes(here),
             *(_open_sizes(found) if named else ()),
-            *(_of_one_number(found) if named else ()),
+            *(one_number_notes(found) if named else ()),
             *(_taken_gains(task, found) if named else ()),
             *implausible(loop.robot, model, task.robot.trust),
             *_refitted_note(here, runs, refitted, found.verdict),
@@ -444,7 +445,7 @@ def _open_sizes(found: Search) -> list[str]:
     return told
 
 
-def _of_one_number(found: Search) -> list[str]:
+def one_number_notes(found: Search) -> list[str]:
     """Which causes have one number together, and why."""
     together: dict[tuple, list[str]] = {}
     for one in found.named:
