@@ -69,15 +69,20 @@ def _less(here: Setting, c: Candidate) -> Candidate | None:
 
 def of_one_kind(here: Setting, ones: Sequence[Candidate]) -> list[list[Candidate]]:
     """Those of a family at joints that the file has alike: the same drive, which moves that joint alone, and the same
-    numbers of it."""
+    numbers of it; joints that turn apart from those that slide, whose units are others."""
     drives, kinds = here.loop.drives, dict[tuple, list[Candidate]]()
+    turns = here.loop.robot.dofs.turns[np.argsort(here.loop.robot.dofs.column)]
     gear = np.abs(np.asarray(drives.transmission))
     stated = values(here.loop, here.known.table)
     for c in ones:
         mine = np.flatnonzero(gear[:, joint_of(here, c)])
         if len(mine) != 1 or np.count_nonzero(gear[mine[0]]) != 1:
             continue
-        own = (gear[mine[0]].max(), *(np.asarray(x)[mine[0]] for x in (drives.gain, drives.bias, drives.force_range)))
+        own = (
+            turns[joint_of(here, c)],
+            gear[mine[0]].max(),
+            *(np.asarray(x)[mine[0]] for x in (drives.gain, drives.bias, drives.force_range)),
+        )
         told = np.concatenate([np.ravel(x) for x in (*own, stated[list(c.entries)])])
         kinds.setdefault(tuple(float(f"{x:.6g}") for x in told), []).append(c)
     return [alike for alike in kinds.values() if len(alike) >= FEWEST_JOINTS]
