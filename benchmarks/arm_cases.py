@@ -29,6 +29,7 @@ from generators import servo_arm6
 
 import figaroh_jax as fj
 from figaroh_jax.rollouts.arm import search_arm
+from figaroh_jax.rollouts.creep import searched_with_both
 from figaroh_jax.rollouts.data import Run, Stretch
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.search import Named, search
@@ -50,36 +51,42 @@ class Detent(fj.JointEffect):
 
 
 def run(
-    hidden: list[tuple[str, int, float]], seed: int, noise: str, *, whole: bool, known: bool, forbid: bool = False
-) -> tuple[str, str, float]:
+    hidden: list[tuple[str, int, float]], seed: int, noise: str, *, whole: bool, known: bool, forbid: bool = False,
+    holds: bool = False, recordings: int = 2,
+) -> tuple[str, str, float]:  # fmt: skip
     """Verdict with its names, what was found, CPU seconds."""
     with tempfile.NamedTemporaryFile("w", suffix=".xml") as file:
         file.write(servo_arm6.model_text(1.6))
         file.flush()
         loop, _ = load_loop(file.name)
     runs = []
-    for number in range(2):
-        r = servo_arm6.record(hidden, seed, number, noise)
+    for number in range(recordings):
+        r = servo_arm6.record(hidden, seed, number, noise, holds)
         runs.append(Run(f"run {number}", r["t"], r["u"], r["q"], None))
-    cut = [Stretch(k, f, 600) for k in range(2) for f in range(0, 1200, 600)]
+    cut = [Stretch(k, f, 600) for k in range(recordings) for f in range(0, 1200, 600)]
     start = time.process_time()
     left_out = tuple(effect for effect, _, _ in hidden) if forbid else ()
     here = setting(loop, runs, gains_known=known, stretches=cut, forbid=left_out)
-    found = (search if whole else search_arm)(here, forbid=left_out)
-    names = {(n.candidate.effect, *n.candidate.at) for n in found.named}
-    alike = {(a.effect, *a.at) for n in found.named for a in n.alike}
+    found = searched_with_both(search if whole else search_arm, here, forbid=left_out)
+    causes = [n for n in found.named if not (holds and n in found.creeps)]
+    names = {(n.candidate.effect, *n.candidate.at) for n in causes}
+    alike = {(a.effect, *a.at) for n in causes for a in n.alike}
     truth = {(effect, *_place(effect, j)) for effect, j, _ in hidden}
     told, also = ({_any_link(name) for name in some} for some in (names, alike))
     if left_out:
-        word = "right" if found.verdict == "unknown" else "wrong" if names else "missed"
+        silent = ("unknown", "named+rest") if found.creeps else ("unknown",)
+        word = "wrong" if names else "right" if found.verdict in silent else "missed"
     elif not hidden:
-        word = "right" if found.verdict == "nothing" else "wrong" if names else "unknown"
-    elif told == truth or (truth <= told | also and all(_true(n, truth) for n in found.named)):
+        word = "wrong" if names else "right" if found.verdict == ("named" if holds else "nothing") else "unknown"
+    elif told == truth or (truth <= told | also and all(_true(n, truth) for n in causes)):
         word = "right"
     elif not told:
         word = "missed" if found.verdict == "nothing" else "unknown"
     else:
         word = "part" if told < truth else "wrong"
+    if holds:
+        at = ", ".join(n.candidate.at[0] for n in found.creeps)
+        word += f" (friction holds at {at})" if at else " (friction that holds not seen)"
     names_text = "+".join(_text(name) for name in sorted(names)) or "-"
     names_text += "".join(f" alike {_text(name)}" for name in sorted(alike))
     proxy = "+".join(f"{n.candidate.effect}({', '.join(n.candidate.at)})" for n in found.proxy) or "-"
@@ -123,6 +130,8 @@ def main() -> None:
     parser.add_argument("--own", action="store_true", help="an effect that is no one of the library's, registered here")
     parser.add_argument("--registered", action="store_true", help="that effect is registered, but not hidden")
     parser.add_argument("--forbid", action="store_true", help="leave the true effect out of the catalogue")
+    parser.add_argument("--holds", action="store_true", help="the arm's friction holds, the file's creeps")
+    parser.add_argument("--recordings", type=int, default=2)
     parser.add_argument("--whole", action="store_true", help="one cause after another, as for other robots")
     args = parser.parse_args()
     count: dict[str, int] = {}
@@ -130,7 +139,8 @@ def main() -> None:
         fj.register(Detent)
     for seed in args.seeds:
         for hidden in _cases(args, np.random.default_rng([seed, 3])):
-            given = {"whole": args.whole, "known": True, "forbid": args.forbid}
+            given: dict[str, Any] = {"whole": args.whole, "known": True, "forbid": args.forbid}
+            given |= {"holds": args.holds, "recordings": args.recordings}
             word, text, seconds = run(hidden, seed, args.noise, **given)
             count[word] = count.get(word, 0) + 1
             label = "+".join(f"{e}@{servo_arm6.NAMES[j]}:{size:g}" for e, j, size in hidden) or "none"

@@ -21,6 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from generators import servo_arm
 
+from figaroh_jax.rollouts.creep import searched_with_both
 from figaroh_jax.rollouts.data import Run
 from figaroh_jax.rollouts.fit import standard_errors
 from figaroh_jax.rollouts.reading import load_loop
@@ -51,7 +52,7 @@ def run(case: str, seed: int, *, forbid: bool) -> tuple[str, Search, float]:
     left_out = (case, *EQUIVALENT.get(case, ())) if forbid else ()
     t, u, q, dq = (recording[k] for k in ("t", "u", "q", "dq"))
     here = setting(loop, [Run(case, t, u, q, dq)], forbid=left_out)
-    found = search(here, forbid=left_out)
+    found = searched_with_both(search, here, forbid=left_out)
     names = "+".join(n.candidate.effect for n in found.named)
     return f"{found.verdict} {names}".strip(), found, time.process_time() - start
 

@@ -26,12 +26,12 @@ from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_
 from .search import Model, Named, Search, Tried, all_but, judged_by_colour, sized, t_of
 from .sensitivity import predicted
 from .setting import Setting, Structure, begins_of, begun, by_recording, evened, free_entries, level_of, thinned
-from .shared import at_all_joints
+from .shared import at_all_joints, t_together
 from .sizes import fitted_without, least_sure, simpler, why_nothing
 from .table import on_table
-from .thresholds import NEAR, NO_CHOICE, T_BESIDE_REST, UNTOLD
+from .thresholds import FEWEST_JOINTS, NEAR, NO_CHOICE, T_BESIDE_REST, UNTOLD
 
-__all__ = ["search_arm"]
+__all__ = ["alike_by_recording", "search_arm"]
 
 _AGAIN = 6  # iterations from the numbers of the model file
 _TOP, _CHECKS = 3, 4  # candidates told as the nearest; those whose held-out squares are looked at in a round
@@ -456,9 +456,20 @@ def _named(
         spare = needless(here, with_all, chosen) if len(chosen) > 1 else None
         if spare is None:
             named = [_name(here, now, with_all, one, lists, check) for one, check in zip(chosen, checks, strict=True)]
+            named = _as_sure_together(here, now, with_all, named)
             return sorted(named, key=lambda n: n.after**2 - n.before**2), with_all
         chosen = [one for one in chosen if one is not spare]
     return None
+
+
+def _as_sure_together(here: Setting, now: Standing, new: Standing, named: list[Named]) -> list[Named]:
+    """What three joints or more turn out to have in one round is borne out by all of them."""
+    alike = len({n.candidate.effect for n in named}) == 1 and len(named) >= FEWEST_JOINTS
+    if not (alike and by_recording(here)):
+        return named
+    runs, joints = np.array([x.run for x in here.stretches]), [joint_of(here, n.candidate) for n in named]
+    t = t_together(now.held, new.held, runs, joints)
+    return [n._replace(t=max(n.t, t)) for n in named]
 
 
 def _together(here: Setting, now: Standing, chosen: Sequence[Tried]) -> Model:

@@ -16,7 +16,7 @@ from ..effects.base import Effect
 from ..errors import InputError, nearest
 from ..formats.xmlfile import read_xml
 from ..results import finite
-from .loop import Loop
+from .loop import STIFFEST, Loop
 from .parameters import UNITS
 
 __all__ = ["SIMULATORS", "described", "described_text", "for_simulator", "with_drives"]
@@ -25,6 +25,7 @@ _NEUTRAL = ("stribeck_speed", "ripple_order", "friction_rate", "friction_share")
 _JOINT = ("armature", "damping", "friction", "stribeck_force", "stribeck_speed", "load_ratio", "stiffness", "rest",
           "play", "offset", "ripple_sine", "ripple_cosine", "ripple_order", "reading", "friction_rate",
           "friction_share")  # fmt: skip
+_ITERATIONS = 100, 50  # of MuJoCo's solver and its line search, its own: with 10 and 20 stiff friction creeps again
 _FAR = 1e10  # what stands in an MJCF for a side without a limit
 
 
@@ -113,6 +114,8 @@ def with_drives(file: Path, content: dict[str, Any]) -> str:
     names = {"euler": "Euler", "implicitfast": "implicitfast", "rk4": "RK4"}
     option.set("timestep", f"{content['dt']:.9g}")
     option.set("integrator", names[content["integrator"]])
+    option.set("iterations", str(_ITERATIONS[0]))
+    option.set("ls_iterations", str(_ITERATIONS[1]))
     _with_limits(root, content)
     for old in root.findall("actuator"):
         root.remove(old)
@@ -174,10 +177,21 @@ def _with_limits(root: Any, content: dict[str, Any]) -> None:
             joint.set("solreflimit", _text(limit["solref"]))
             joint.set("solimplimit", _text(limit["solimp"]))
         _set_range(joint, "actuatorfrc", limit["torque_range"])
-        if content["law"] == "soft" and own.get("friction_rate", 0.0) > 0:
-            impedance = 1.0 / (1.0 + own["friction_share"])  # one that is the same at any depth gives both numbers
-            joint.set("solreffriction", _text([2.0 / (own["friction_rate"] * impedance), 1.0]))
+        if content["law"] == "hard" or own.get("friction_rate", 0.0) > 0:
+            impedance, time = _friction_words(content, own)
+            joint.set("solreffriction", _text([time, 1.0]))
             joint.set("solimpfriction", _text([impedance, impedance, 0.001, 0.5, 2.0]))
+
+
+def _friction_words(content: dict[str, Any], own: dict[str, float]) -> tuple[float, float]:
+    """MuJoCo's impedance and time constant of dry friction; of a hard one as stiff as it takes.
+
+    An impedance that is the same at any depth gives both numbers of the soft law.
+    """
+    if content["law"] == "hard":
+        return STIFFEST, 2.0 * content["dt"]
+    impedance = 1.0 / (1.0 + own["friction_share"])
+    return impedance, 2.0 / (own["friction_rate"] * impedance)
 
 
 def _set_range(element: Any, word: str, ends: list[float | None] | None) -> None:

@@ -48,6 +48,7 @@ __all__ = [
 Activation = Literal["none", "integrator", "filter", "filterexact"]
 Integrator = Literal["euler", "implicitfast", "rk4"]
 _TINY = 1e-15  # MuJoCo's mjMINVAL
+STIFFEST = 0.9999  # impedance of a soft constraint, beyond which MuJoCo takes none
 _HARD = 1e-9  # softness that a hard friction keeps, as a share of the joint's mobility
 
 

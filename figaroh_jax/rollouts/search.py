@@ -110,6 +110,7 @@ class Search:
     faults: list[Fault] = field(default_factory=list)  # why they were
     spread: np.ndarray | None = None  # (columns of `last`,) by recordings: half of each 95 % interval over 1.96
     doubtful: list[tuple[Name, float, str]] = field(default_factory=list)  # of no sure size, left out, with their gain
+    creeps: list[Named] = field(default_factory=list)  # friction that holds where the file's creeps
     beside: Fit | None = None  # where a cause that is too slight to be named is left out: with it noise alone is left
 
 

@@ -25,7 +25,7 @@ from .search import Named, Tried, sized, t_of_recordings
 from .setting import Setting, Structure, by_recording, free_entries, start_values
 from .thresholds import CONFIDENT, FEWEST_JOINTS, GAIN, HOPEFUL, T_BESIDE_REST
 
-__all__ = ["as_one_number", "at_all_joints", "of_one_kind"]
+__all__ = ["as_one_number", "at_all_joints", "of_one_kind", "t_together"]
 
 _PART = 1 / 3  # of what it adds to, from which its fit starts
 _EARLY, _SOON = 4, 0.5  # steps from each start, and the share of what is to be gained that is seen by then
@@ -197,16 +197,17 @@ def _together(
     runs, gains = np.array([x.run for x in here.stretches]), [one.gain for one in told.values()]
     if sum(one.t > CONFIDENT for one in told.values()) < FEWEST_JOINTS or np.mean(gains) < HOPEFUL:
         return [], now
-    if _t_together(now.held, new.held, runs, [joint_of(here, c) for c in told]) < T_BESIDE_REST:
+    t = t_together(now.held, new.held, runs, [joint_of(here, c) for c in told])
+    if t < T_BESIDE_REST:
         return [], now
     named = []
-    for c, one in told.items():
+    for c, one in told.items():  # borne out by all of them: as sure as they are together
         before, after = (rms_of(here, x, joint_of(here, c)) for x in (now.held, new.held))
-        named.append(Named(c, one.t, one.gain, (), before, after))
+        named.append(Named(c, t, one.gain, (), before, after))
     return sorted(named, key=lambda n: n.after**2 - n.before**2), new
 
 
-def _t_together(worse: np.ndarray, better: np.ndarray, runs: np.ndarray, joints: Sequence[int]) -> float:
+def t_together(worse: np.ndarray, better: np.ndarray, runs: np.ndarray, joints: Sequence[int]) -> float:
     """t over recordings of the mean logarithm of the joints' gains: each joint and recording counts alike."""
     logs = []
     for j in joints:

@@ -23,6 +23,7 @@ from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, Experiment, G
 from .alone import inseparable, separable
 from .arm import search_arm
 from .causes import BASELINE
+from .creep import creep_notes, searched_with_both
 from .data import Run, Stretch, ahead_of_command, noise_of, regular, windows
 from .fit import Fit
 from .loop import Loop, alike
@@ -85,7 +86,7 @@ def diagnose_rollout_task(
         seek = search_arm if separable(loop) else search
         if loop.robot.nv > 1 and seek is search:
             progress(f"looking for one cause after another, which takes long: {inseparable(loop)}", 0.0)
-        found = seek(here, progress, forbid=task.diagnose.forbid)
+        found = searched_with_both(seek, here, progress, forbid=task.diagnose.forbid)
         if not np.isfinite(found.first.cost):
             raise InputError(f"{task.robot.model}: {diverged(here, found.first)}")
         progress("measuring the gain", 0.9)
@@ -206,10 +207,11 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
     gain = _gain(held, runs, found)
     model = extended_of(final if n == final.robot.nv else start)
     traces = _traces(here, runs, first, found, last, held)
-    refitted = _refitted(here, last, found.spread if named else None)
+    refitted = _refitted(here, found if named else None, last)
+    creeps = creep_notes(here, found) if named else {}
     diagnosis = Diagnosis(
         verdict=_verdict(found),
-        causes=(*_faulty(found, here), *(_cause(one, found, here) for one in (found.named if named else ()))),
+        causes=(*_faulty(found, here), *(_cause(one, found, here, creeps) for one in (found.named if named else ()))),
         p_value=found.p_value,
         joints=tuple(loop.robot.dof_names[k] for k in loop.measured),
         before=before,
@@ -251,13 +253,14 @@ def all_slide(loop: Loop) -> bool:
     return not _turns(loop)[list(loop.measured)].any()
 
 
-def _refitted(here: Setting, model: tuple[Structure, Fit], spread: np.ndarray | None) -> tuple[str, ...]:
-    """Numbers of the baseline that the file has surely otherwise, in words, those first that are surest."""
+def _refitted(here: Setting, found: Search | None, model: tuple[Structure, Fit]) -> tuple[str, ...]:
+    """Numbers of the baseline that the file has surely otherwise and that no cause has, those first that are surest."""
     structure, last = model
     filed, told = values(here.loop, here.known.table), []
-    for column, error in enumerate(told_errors(structure, last, spread)):
+    of_causes = {k for n in found.named for k in n.candidate.entries} if found else set[int]()
+    for column, error in enumerate(told_errors(structure, last, found.spread if found else None)):
         k = int(last.free[column])
-        if k not in here.baseline or not (np.isfinite(error) and error > 0):
+        if k not in here.baseline or k in of_causes or not (np.isfinite(error) and error > 0):
             continue
         entry, value = here.known.table[k], float(last.theta[k])
         moved = abs(value - filed[k])
@@ -402,7 +405,7 @@ def _kinds_note(loop: Loop, gain: Gain) -> tuple[str, ...]:
     return (f"the error in {gain.unit} is that of the joints that {kind}: {', '.join(names)}",)
 
 
-def _cause(one: Named, found: Search, here: Setting) -> Cause:
+def _cause(one: Named, found: Search, here: Setting, creeps: dict[Name, str]) -> Cause:
     structure, fitted = found.structure, found.last
     errors = told_errors(structure, fitted, found.spread)
     parameters = {}
@@ -425,10 +428,10 @@ def _cause(one: Named, found: Search, here: Setting) -> Cause:
         parameters = {
             "about_x": Estimate(-y.value / _G, y.std / _G, "rad"), "about_y": Estimate(x.value / _G, x.std / _G, "rad")
         }  # fmt: skip
-    at = one.candidate.at
+    name, at = Name(one.candidate.effect, one.candidate.at), one.candidate.at
     sure = 1.0 / (1 + len(one.alike)) * (0.98 if found.verdict == "named" else 0.8)
     gain = Gain(one.before, one.after, "m" if _slides(here.loop, at) else "rad")
-    return Cause(Name(one.candidate.effect, at), parameters, sure, gain, one.alike, note=one.candidate.kind.looks_like)
+    return Cause(name, parameters, sure, gain, one.alike, note=creeps.get(name, one.candidate.kind.looks_like))
 
 
 def _open_sizes(found: Search) -> list[str]:

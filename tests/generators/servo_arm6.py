@@ -44,13 +44,15 @@ NAMES = ("pan", "lift", "elbow", "flex", "roll", "jaw")
 
 
 def model_text(
-    scale: float = 1.0, payload: float = 0.0, spring: int = -1, tilt: float = 0.0, coupled: tuple[int, float] = (0, 0.0)
-) -> str:
-    """The arm as an MJCF file; `spring`: a hinge between motor and link of that joint."""
+    scale: float = 1.0, payload: float = 0.0, spring: int = -1, tilt: float = 0.0,
+    coupled: tuple[int, float] = (0, 0.0), holds: bool = False,
+) -> str:  # fmt: skip
+    """The arm as an MJCF file; `spring`: a hinge between motor and link of that joint; `holds`: its friction is stiff."""
+    held = f' solreffriction="{2 * DT} 1" solimpfriction="0.9999 0.9999"' if holds else ""
     body, drives = "", ""
     for k, name in enumerate(NAMES):
         own = (f'<joint name="{name}" axis="{AXIS[k]}" armature="{scale * ARMATURE[k]:.6g}" damping="{scale * DAMPING[k]:.6g}" '
-               f'frictionloss="{scale * FRICTION[k]:.6g}"/>')  # fmt: skip
+               f'frictionloss="{scale * FRICTION[k]:.6g}"{held}/>')  # fmt: skip
         mass = MASS[k] + (payload if k == 5 else 0.0)
         half = LENGTH[k] / 2
         size = MASS[k] * LENGTH[k] ** 2 / 12 + 1e-5
@@ -81,7 +83,7 @@ def command(seed: int, number: int) -> np.ndarray:
 
 
 def record(
-    hidden: Sequence[tuple[str, int, float]], seed: int, number: int, noise: str = "white"
+    hidden: Sequence[tuple[str, int, float]], seed: int, number: int, noise: str = "white", holds: bool = False
 ) -> dict[str, np.ndarray]:
     """`t`, `u`, `q` at 100 Hz of a recording; `hidden`: effect, joint, size."""
     import mujoco
@@ -90,7 +92,7 @@ def record(
     sprung = next((what[k][0] for k in ("joint_elasticity", "backlash") if k in what), -1)
     text = model_text(
         payload=what.get("payload", (5, 0.0))[1], spring=sprung, tilt=what.get("gravity_tilt", (0, 0.0))[1],
-        coupled=what.get("coupled_transmission", (0, 0.0)),
+        coupled=what.get("coupled_transmission", (0, 0.0)), holds=holds,
     )  # fmt: skip
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)

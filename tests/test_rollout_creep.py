@@ -1,0 +1,116 @@
+"""Friction that holds a joint where MuJoCo's soft constraint creeps, made by MuJoCo C with a stiff one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from figaroh_jax.rollouts.creep import creep_notes, creep_speed, searched_with_both, stiff
+from figaroh_jax.rollouts.data import Run
+from figaroh_jax.rollouts.export import described, with_drives
+from figaroh_jax.rollouts.loop import STIFFEST
+from figaroh_jax.rollouts.reading import load_loop
+from figaroh_jax.rollouts.search import Search, search
+from figaroh_jax.rollouts.setting import Setting, setting
+from figaroh_jax.rollouts.task import simulated
+
+DT, EVERY, SECONDS = 0.002, 5, 12.0
+NOISE = 2e-4  # rad
+
+
+def servo(friction: float = 0.4, more: str = "", damping: float = 0.3) -> str:
+    """A lever under gravity with a soft position drive, whose friction holds it off the command."""
+    return f"""<mujoco><option timestep="{DT}" integrator="implicitfast"/><worldbody><body pos="0 0 1">
+    <joint name="lift" axis="0 1 0" armature="0.03" damping="{damping}" frictionloss="{friction}" {more}/>
+    <inertial pos="0.15 0 0" mass="0.4" diaginertia="0.001 0.001 0.001"/></body></worldbody>
+    <actuator><position name="lift" joint="lift" kp="8" kv="0.2"/></actuator></mujoco>"""
+
+
+STIFF = f'solreffriction="{2 * DT} 1" solimpfriction="{STIFFEST} {STIFFEST}"'
+
+
+def recorded(text: str, number: int, detent: float = 0.0) -> Run:
+    """Steps and holds; `detent` N m of a torque of the angle that is no effect of the library's."""
+    model = mujoco.MjModel.from_xml_string(text)
+    data, rng = mujoco.MjData(model), np.random.default_rng([7, number])
+    held = rng.uniform(-0.7, 0.7, round(SECONDS / 1.5) + 1)
+    time = np.arange(round(SECONDS / DT / EVERY)) * DT * EVERY
+    wave = 0.3 * np.sin(2 * np.pi * time * rng.uniform(0.1, 0.4))
+    u = np.repeat(held[(time / 1.5).astype(int)] + np.where(time < 3, 0.0, wave), EVERY)
+    data.qpos[:], q = held[0], np.zeros(len(u))
+    for k, one in enumerate(u):
+        q[k], data.ctrl[:] = data.qpos[0], one
+        data.qfrc_applied[:] = detent * np.sign(np.sin(60 * data.qpos))
+        mujoco.mj_step(model, data)
+    q = q[::EVERY] + rng.normal(0, NOISE, len(u) // EVERY)
+    return Run(f"run {number}", np.arange(len(q)) * DT * EVERY, u[::EVERY, None], q[:, None], None)
+
+
+def diagnosed(folder: Path, made: str, filed: str, detent: float = 0.0) -> tuple[Setting, Search]:
+    (folder / "servo.xml").write_text(filed)
+    here = setting(load_loop(folder / "servo.xml")[0], [recorded(made, k, detent) for k in range(3)])
+    return here, searched_with_both(search, here)
+
+
+def test_the_speed_of_creep_is_mujocos(tmp_path: Path) -> None:
+    """A lever that friction holds against all that it can moves in MuJoCo C as fast as is said."""
+    (tmp_path / "servo.xml").write_text(servo())
+    loop, _ = load_loop(tmp_path / "servo.xml")
+    model = mujoco.MjModel.from_xml_string(servo())
+    model.opt.gravity[:], model.actuator_gainprm[:], model.actuator_biasprm[:], model.dof_damping[:] = 0, 0, 0, 0
+    data = mujoco.MjData(model)
+    data.qfrc_applied[:] = 0.4 * 0.999
+    for _ in range(500):
+        mujoco.mj_step(model, data)
+    assert data.qvel[0] == pytest.approx(0.999 * creep_speed(loop)[0], rel=1e-3)
+    assert creep_speed(stiff(loop))[0] < 2e-3 * creep_speed(loop)[0]
+
+
+def test_friction_that_holds_is_named_where_the_files_creeps(tmp_path: Path) -> None:
+    """Nothing else is missing: friction is named, nothing stays, its size is right, and MuJoCo C moves as told."""
+    here, found = diagnosed(tmp_path, servo(more=STIFF), servo(friction=0.3, damping=0.2))
+    assert found.verdict == "named"
+    (named,) = found.named
+    assert (named.candidate.effect, named.candidate.at) == ("friction_loss", ("lift",))
+    (entry,) = named.candidate.entries
+    assert found.last.theta[entry] == pytest.approx(0.4, rel=0.01)
+    assert named.after < 0.5 * named.before
+    (note,) = creep_notes(here, found).values()
+    assert "mrad/s" in note
+    assert "solimpfriction 0.9999" in note
+
+
+def test_friction_that_creeps_as_the_files_is_nothing(tmp_path: Path) -> None:
+    _, found = diagnosed(tmp_path, servo(), servo(friction=0.3, damping=0.2))
+    assert (found.verdict, found.named, found.creeps) == ("nothing", [], [])
+
+
+@pytest.mark.parametrize("detent", [0.1, 0.3])
+def test_what_is_not_in_the_catalogue_is_no_friction_that_holds(tmp_path: Path, detent: float) -> None:
+    """A robot whose friction creeps as the file's, with a torque of its own beside it."""
+    _, found = diagnosed(tmp_path, servo(), servo(friction=0.3, damping=0.2), detent)
+    assert found.creeps == []
+
+
+def test_the_exported_file_holds_in_mujoco(tmp_path: Path) -> None:
+    """The stiff loop, and one whose friction is hard, as MJCF: MuJoCo C with its own options moves alike."""
+    (tmp_path / "servo.xml").write_text(servo())
+    run = recorded(servo(more=STIFF), 5)
+    for law, bound in (("soft", 1e-9), ("hard", 1e-4)):
+        loop = load_loop(tmp_path / "servo.xml", law=law)[0]
+        loop = stiff(loop) if law == "soft" else loop
+        text = with_drives(tmp_path / "servo.xml", described(loop))
+        model = mujoco.MjModel.from_xml_string(text)
+        assert model.opt.iterations >= 100
+        assert model.opt.ls_iterations >= 50
+        (tmp_path / "out.xml").write_text(text)
+        data, u = mujoco.MjData(model), np.repeat(run.command[:, 0], EVERY)
+        data.qpos[:], q = run.position[0], np.zeros(len(u))
+        ours = simulated(loop, run._replace(position=np.full_like(run.position, run.position[0])))
+        for k, one in enumerate(u):
+            q[k], data.ctrl[:] = data.qpos[0], one
+            mujoco.mj_step(model, data)
+        np.testing.assert_allclose(q[::EVERY], ours[:, 0], atol=bound, rtol=0)
