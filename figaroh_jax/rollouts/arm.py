@@ -27,7 +27,8 @@ from .search import Model, Named, Search, Tried, all_but, judged_by_colour, size
 from .sensitivity import predicted
 from .setting import Setting, Structure, begins_of, begun, by_recording, evened, free_entries, level_of, thinned
 from .shared import at_all_joints, t_together
-from .sizes import fitted_without, least_sure, simpler, why_nothing
+from .sizes import fitted_without, simpler
+from .steady import in_doubt
 from .table import on_table
 from .thresholds import FEWEST_JOINTS, NEAR, NO_CHOICE, T_BESIDE_REST, UNTOLD
 
@@ -168,14 +169,16 @@ def _of_sure_size(
 ) -> tuple[list[tuple[Name, float, str]], list[Named], Standing, np.ndarray | None] | None:
     """What is told of the least sure cause whose told interval holds no effect, and the model without it; else None.
 
-    With it go those of other joints that have its numbers.
+    Beside a rest also of one whose size is not the same throughout. With it go those of other joints that have its
+    numbers.
     """
-    if _verdict(here, now, found) not in ("named", "named+rest"):
+    if (verdict := _verdict(here, now, found)) not in ("named", "named+rest"):
         return None
-    gone = least_sure([n.candidate for n in found], now.model.structure, now.model.fit, spread)
-    if gone is None:
+    doubt = in_doubt([n.candidate for n in found], here, *now.model[:2], spread, rest=verdict == "named+rest")
+    if doubt is None:
         return None
-    why, kept = why_nothing(gone, now.model.structure, now.model.fit, spread), all_but(found, gone)
+    gone, why = doubt
+    kept = all_but(found, gone)
     told = [(Name(n.candidate.effect, n.candidate.at), max(n.gain, 0.0), why) for n in found if n not in kept]
     return told, *_without(here, now, kept, gone, even, forbid)
 

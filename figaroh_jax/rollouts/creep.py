@@ -98,11 +98,11 @@ def _fitted(here: Setting, structure: Structure, last: Fit, free: Sequence[int])
                rough=ROUGH)[0]  # fmt: skip
 
 
-def _stands(here: Setting, found: Search) -> Standing:
-    """The end of a search on the rows of `here`, and what it predicts of those that a fit has not seen."""
-    structure = found.structure._replace(data=here.cut(found.structure.loop))
-    free = [int(k) for k in found.last.free if k >= 0]
-    return standing(here, structure, _fitted(here, structure, found.last, free), free)
+def _stands(here: Setting, structure: Structure, last: Fit) -> Standing:
+    """A fit on the rows of `here`, and what it predicts of those that it has not seen."""
+    structure = structure._replace(data=here.cut(structure.loop))
+    free = [int(k) for k in last.free if k >= 0]
+    return standing(here, structure, _fitted(here, structure, last, free), free)
 
 
 class _Told(NamedTuple):
@@ -138,10 +138,14 @@ def _better(here: Setting, found: Search, other: Search) -> Search:
     some = thinned(sound)
     if rest and not by_recording(some):
         return found
-    soft, hard = _stands(some, found), _stands(some, other)
+    begun = [Structure(m, here.known.table, here.data) for m in (here.loop, stiff(here.loop))]
+    soft, hard = _stands(some, found.structure, found.last), _stands(some, other.structure, other.last)
+    first = _stands(some, begun[0], found.first), _stands(some, begun[1], other.first)
     level = np.asarray(put(other.structure.loop, other.structure.table, other.last.theta).joints.friction)
-    joints = [j for j in range(here.loop.robot.nv) if level[j] > 0]
-    told, t = _told(some, soft, hard, joints, HOPEFUL if rest else GAIN)
+    least, joints = HOPEFUL if rest else GAIN, [j for j in range(here.loop.robot.nv) if level[j] > 0]
+    alone, sure = _told(some, *first, joints, least)  # without the causes that either search has found
+    told, t = _told(some, soft, hard, [one.joint for one in alone], least)
+    t = min(t, sure)
     if t < T_BESIDE_REST or (rest and np.mean([one.gain for one in told]) < GAIN_BESIDE_REST):
         return found
     if other.verdict == "unknown":

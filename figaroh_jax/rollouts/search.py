@@ -31,8 +31,9 @@ from .setting import (
     start_values,
     whitened,
 )
-from .sizes import fitted_without, least_sure, simpler, why_nothing
+from .sizes import fitted_without, simpler
 from .starting import shown, suggested
+from .steady import in_doubt
 from .thresholds import (
     CLEAR_OF_NOTHING,
     CONFIDENT,
@@ -206,11 +207,13 @@ def _of_sure_size(
     doubtful = list[tuple[tuple[Name, float, str], Model]]()
     while _verdict(here, now.excess, found) in ("named", "named+rest"):
         spread = _spread(here, now)
-        gone = least_sure([n.candidate for n in found], now.structure, now.fit, spread)
-        if gone is None:
+        causes, rest = [n.candidate for n in found], now.excess >= 1.0
+        doubt = in_doubt(causes, here, now.structure, now.fit, spread, rest=rest)
+        if doubt is None:
             break
+        gone, why = doubt
         (one,) = (n for n in found if n.candidate is gone)
-        told = Name(gone.effect, gone.at), max(one.gain, 0.0), why_nothing(gone, now.structure, now.fit, spread)
+        told = Name(gone.effect, gone.at), max(one.gain, 0.0), why
         less = simpler(here, now.structure, now.fit, now.free, gone, forbid)
         found, old = [n for n in found if n is not one], now.structure
         structure, last, free = fitted_without(here, old, now.fit, now.free, gone)

@@ -15,6 +15,7 @@ T_WITHOUT_REST = 2.5  # t, where nothing but noise is left
 T_BESIDE_REST = 3.0  # t, where more than noise stays beside it
 GAIN_BESIDE_REST = 0.25  # less may stand in for the rest; not of what every joint has
 SMALL = 0.002  # gain below which a cause found with others is not missed
+STEADY = (0.004, 0.02)  # of what a cause explains: what sizes by position or speed, by time or recording, explain more
 SLIGHT = 1e-3  # of the squares that others explain at its joint: less makes up for a law that is not theirs
 MOST_OF_IT = 0.9  # gain on held-out data from which places count alike, however large the squares of a few are
 LEAST_OF_A_RECORDING = 0.1  # of the mean squares of recordings: gains are told beside so much
