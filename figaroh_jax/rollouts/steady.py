@@ -22,7 +22,7 @@ from .setting import Setting, Structure
 from .sizes import least_sure, why_nothing
 from .thresholds import STEADY
 
-__all__ = ["in_doubt"]
+__all__ = ["Normal", "in_doubt"]
 
 _PARTS = 5  # of the positions, speeds and the time
 _SMALL = 1e-9  # of a column's squares, that keeps a direction without data from mattering
@@ -44,10 +44,8 @@ def in_doubt(
     worst = _least_steady(here, structure, last, causes) if rest else None
     if worst is None:
         return None
-    size = f"{worst.share:.2g} of what it explains"
-    return (
-        worst.candidate,
-        f"its size is not the same throughout, as of what stands in for another: by {worst.by} {size}",
+    return worst.candidate, (
+        f"its size differs by {worst.by} ({worst.share:.2g} of what it explains), as that of what stands in for another"
     )
 
 
@@ -73,7 +71,7 @@ def _unsteadiness(here: Setting, structure: Structure, last: Fit, c: Candidate) 
     size = [int(np.flatnonzero(last.free == k)[0]) for k in c.entries[: max(c.kind.together, 1)] if k in last.free]
     if not size:
         return []
-    normal = _Normal(structure, last, size)
+    normal = Normal(structure, last, size)
     return [_Unsteady(c, by, normal.more(parts), least) for by, parts, least in _parts(here, structure, c)]
 
 
@@ -104,8 +102,8 @@ def _fifths(values: np.ndarray) -> np.ndarray:
     return np.searchsorted(np.quantile(values, np.arange(1, _PARTS) / _PARTS), values)
 
 
-class _Normal:
-    """Normal equations by blocks of a fit, of what is free beside the size of a cause and of the size."""
+class Normal:
+    """Normal equations by blocks of a fit, of what is free beside the size of a cause and of the size (columns)."""
 
     def __init__(self, structure: Structure, last: Fit, size: Sequence[int]):
         count = len(last.free)
