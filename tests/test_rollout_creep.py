@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from schema import matches
 
+from figaroh_jax.cli import main
 from figaroh_jax.rollouts.creep import creep_notes, creep_speed, searched_with_both, stiff
 from figaroh_jax.rollouts.data import Run
 from figaroh_jax.rollouts.export import described, with_drives
@@ -114,3 +117,42 @@ def test_the_exported_file_holds_in_mujoco(tmp_path: Path) -> None:
             q[k], data.ctrl[:] = data.qpos[0], one
             mujoco.mj_step(model, data)
         np.testing.assert_allclose(q[::EVERY], ours[:, 0], atol=bound, rtol=0)
+
+
+def test_the_command_line_names_it_and_identify_fits_with_it(tmp_path: Path) -> None:
+    """Three recordings that friction holds in, by both commands; one held out moves, in the other the joint stands."""
+    (tmp_path / "servo.xml").write_text(servo(friction=0.3, damping=0.2))
+    runs = [recorded(servo(more=STIFF), k) for k in range(4)]
+    still = np.full_like(runs[0].position, 0.1)  # rad, at which the drive holds the weight with less than friction
+    stands = runs[0]._replace(command=still + 0.15 * 0.4 * 9.81 * np.cos(0.1) / -8.0, position=still)
+    for k, run in enumerate([*runs, stands]):
+        np.savez(tmp_path / f"run{k}.npz", t=run.time, u=run.command, q=run.position)
+    data = [{"file": f"run{k}.npz", "time": "t", "command": "u", "position": "q"} for k in range(5)]
+    roles = [one | {"role": "fit" if k < 3 else "holdout"} for k, one in enumerate(data)]
+    task = tmp_path / "task.yaml"
+    task.write_text(json.dumps({"robot": {"model": "servo.xml"}, "data": roles}))
+
+    assert main(["diagnose", str(task), "--out", str(tmp_path / "d"), "--quiet"]) == 0
+    answer = json.loads((tmp_path / "d" / "answer.json").read_text())
+    assert answer["verdict"] == "named"
+    (cause,) = answer["causes"]
+    assert (cause["effect"], cause["at"]) == ("friction_loss", ["lift"])
+    assert answer["p_value"] < 1e-3
+    assert any(note.startswith("friction_loss (lift): it holds the joint") for note in answer["notes"])
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "d" / "model" / "robot.xml"))
+    data_, u, q = mujoco.MjData(model), np.repeat(runs[3].command[:, 0], EVERY), np.zeros(len(runs[3].time) * EVERY)
+    data_.qpos[:] = runs[3].command[0]
+    for k, one in enumerate(u):
+        q[k], data_.ctrl[:] = data_.qpos[0], one
+        mujoco.mj_step(model, data_)
+    assert np.sqrt(np.mean((q[::EVERY] - runs[3].position[:, 0]) ** 2)) < 2 * NOISE
+
+    assert main(["identify", str(task), "--out", str(tmp_path / "i"), "--quiet"]) == 0
+    result = json.loads((tmp_path / "i" / "result.json").read_text())
+    matches("identify", result)
+    told = {one["expression"]: one["value"] for one in result["base_parameters"]}
+    assert told["friction lift"] == pytest.approx(0.4, rel=0.01)
+    assert told["damping lift"] == pytest.approx(0.3, rel=0.02)
+    assert any("friction holds where the soft friction of the file" in note for note in result["notes"])
+    assert result["holdout"]["run4"]["relative"] == result["holdout"]["run4"]["r2"] == [None]
+    assert result["holdout"]["run3"]["relative"][0] < 0.01

@@ -134,11 +134,14 @@ def _table(found: RolloutIdentification) -> dict[str, Any]:
 def _sentence(found: RolloutIdentification, robot: str) -> str:
     good = sum(one["status"] == "identified" for one in _parameters(found))
     judged = list(found.result["holdout"].values()) or [found.result["fit"]]
-    worst = 100 * max(max(one["relative"]) for one in judged)
+    shares = [100 * x for one in judged for x in one["relative"] if x is not None]
+    numbers = f"{good} of {len(_parameters(found))} numbers of {robot} are identified."
+    if not shares:  # nothing moves
+        return numbers
     what = "Held-out motions are" if found.result["holdout"] else "Fitted stretches are"
     return (
-        f"{what} simulated from the command with an error of at most {wording.number(worst, 2)} % of each joint's"
-        f" motion; {good} of {len(_parameters(found))} numbers of {robot} are identified."
+        f"{what} simulated from the command with an error of at most {wording.number(max(shares), 2)} % of each joint's"
+        f" motion; {numbers}"
     )
 
 
@@ -146,7 +149,8 @@ def _qualities(found: RolloutIdentification) -> list[Quality]:
     fit, held = found.result["fit"], list(found.result["holdout"].values())
     rows = []
     for j, (joint, unit) in enumerate(zip(found.joints, found.units, strict=True)):
-        share = max(one["relative"][j] for one in held) if held else fit["relative"][j]
+        shares = [one["relative"][j] for one in held or [fit] if one["relative"][j] is not None]
+        share = max(shares, default=float("nan"))  # of a joint that stands there is none
         given, fitted = _rms(found, "before", j), _rms(found, "after", j)
         rows.append(Quality(joint, unit, given, fitted, fit["noise"][j], share, 1 - share**2))
     return rows

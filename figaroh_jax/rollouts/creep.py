@@ -30,7 +30,7 @@ from .setting import Setting, Structure, by_recording, largest_forces, thinned
 from .shared import t_together
 from .thresholds import CONFIDENT, GAIN, GAIN_BESIDE_REST, HOPEFUL, T_BESIDE_REST
 
-__all__ = ["creep_notes", "creep_speed", "searched_with_both", "stiff"]
+__all__ = ["creep_notes", "creep_speed", "fitted_with_both", "searched_with_both", "stiff"]
 
 _FRICTION = "friction_loss"
 
@@ -80,6 +80,36 @@ def searched_with_both(
         return found
     other = seek(replace(here, loop=stiff(here.loop)), progress, forbid=forbid)
     return _better(here, found, other) if np.isfinite(other.last.cost) else found
+
+
+def fitted_with_both(here: Setting, first: Fit) -> tuple[Setting, Fit, tuple[str, ...]]:
+    """The baseline's fit with friction that holds where recordings left out are surely predicted better by it, and
+    what is said of that; else the fit as it is."""
+    structure = Structure(here.loop, here.known.table, here.data)
+    creeps = here.loop.law == "soft" and bool(creep_speed(put(*structure[:2], first.theta)).any())
+    if not creeps or excess_of(here, structure, first).max() < 1.0:
+        return here, first, ()
+    some, held = thinned(here), replace(here, loop=stiff(here.loop))
+    other = _fitted(held, structure._replace(loop=held.loop), first, here.baseline)
+    both = [_stands(some, structure._replace(loop=s.loop), f) for s, f in ((here, first), (held, other))]
+    level = np.asarray(put(*structure[:2], other.theta).joints.friction)
+    told, t = _told(some, both[0], both[1], [j for j in range(here.loop.robot.nv) if level[j] > 0], GAIN)
+    if t < T_BESIDE_REST:
+        return here, first, ()
+    names, speed = here.loop.robot.dof_names, creep_speed(put(*structure[:2], other.theta))
+    at = ", ".join(f"{names[j]} ({1e3 * speed[j]:.2g} {_unit(here.loop, j)}/s)" for j, _, _ in told)
+    return (
+        held,
+        other,
+        (
+            f"friction holds where the soft friction of the file would let joints creep: {at}; recordings left out are"
+            f" predicted better by stiff friction (solimpfriction {STIFFEST}), which the fit and model/robot.xml have",
+        ),
+    )
+
+
+def _unit(loop: Loop, joint: int) -> str:
+    return "mrad" if loop.robot.dofs.turns[np.argsort(loop.robot.dofs.column)][joint] else "mm"
 
 
 def _is_asked(here: Setting, found: Search, forbid: Sequence[str]) -> bool:
@@ -167,6 +197,7 @@ def _better(here: Setting, found: Search, other: Search) -> Search:
         named=[*sorted(named, key=lambda n: n.after**2 - n.before**2), *other.named],
         creeps=creeps,
         first=found.first,
+        p_value=found.p_value,
         table=steps,
         held=[found.held[0], *other.held],
         setting=replace(sound, loop=here.loop),
@@ -198,13 +229,13 @@ def creep_notes(here: Setting, found: Search) -> dict[Name, str]:
         lambda m: (m.joints.friction_share, m.joints.friction_rate), last,
         (here.loop.joints.friction_share, here.loop.joints.friction_rate),
     )  # fmt: skip
-    speed, turns = creep_speed(soft), here.loop.robot.dofs.turns[np.argsort(here.loop.robot.dofs.column)]
+    speed = creep_speed(soft)
     notes = dict[Name, str]()
     for one in found.creeps:
         j = joint_of(here, one.candidate)
         notes[Name(one.candidate.effect, one.candidate.at)] = (
             "it holds the joint, which the soft friction of the file would let creep by up to"
-            f" {1e3 * speed[j]:.2g} {'mrad' if turns[j] else 'mm'}/s; model/robot.xml has it stiff (solimpfriction"
+            f" {1e3 * speed[j]:.2g} {_unit(here.loop, j)}/s; model/robot.xml has it stiff (solimpfriction"
             f" {STIFFEST})"
         )
     return notes

@@ -13,6 +13,7 @@ import numpy as np
 from ..effects.plausibility import implausible
 from ..errors import InputError
 from ..results import Trace
+from .creep import fitted_with_both
 from .data import Run, Stretch, noise_of, windows
 from .fit import Fit, System, fit, standard_errors
 from .loop import Loop
@@ -71,10 +72,11 @@ def identify_rollout_task(
         first = begun(here)
         if not np.isfinite(first.cost):
             raise InputError(f"{task.robot.model}: {diverged(here, first)}")
+        here, first, more = fitted_with_both(here, first)
         here, first = _by_colour(here, first)
         final = put(here.loop, here.known.table, first.theta)
         held = {run.name: (run, simulated(final, run)) for run in runs if run.holdout}
-        notes = (*notes, *colour_notes(here), *implausible(loop.robot, extended_of(final), task.robot.trust))
+        notes = (*notes, *more, *colour_notes(here), *implausible(loop.robot, extended_of(final), task.robot.trust))
         result = _result(here, first, held, notes)
         progress("simulating the recordings", 0.9)
         traces = _traces(loop, final, runs)
@@ -136,8 +138,12 @@ def _result(
         "base_parameters": parameters,
         "links": [],
         "effects": [],
-        "fit": {"rms": rms.tolist(), "relative": _relative(here, rms), "noise": here.spread.tolist()},
-        "holdout": {name: _held(run, read) for name, (run, read) in held.items()},
+        "fit": {
+            "rms": rms.tolist(),
+            "relative": _shares(here, rms, np.concatenate([run.position for run in here.runs])),
+            "noise": here.spread.tolist(),
+        },
+        "holdout": {name: _held(here, run, read) for name, (run, read) in held.items()},
         "notes": [*notes, *_left(here, rms), *_trades([names[free.index(k)] for k in told], correlation)],
         "unit": "m" if all_slide(here.loop) else "rad",
     }
@@ -174,15 +180,16 @@ def _parameter(here: Setting, first: Fit, column: int, error: float) -> dict[str
     }
 
 
-def _relative(here: Setting, rms: np.ndarray) -> list[float]:
-    spread = np.concatenate([run.position for run in here.runs]).std(0)
-    return (rms / np.maximum(spread, 1e-12)).tolist()
+def _shares(here: Setting, error: np.ndarray, position: np.ndarray) -> list[float | None]:
+    """Errors over the joints' motion; None of a joint that stands: there is no motion that a share could be of."""
+    spread, moves = position.std(0), position.std(0) > _NOT_NOISE * here.spread
+    return [float(e / s) if moving else None for e, s, moving in zip(error, spread, moves, strict=True)]
 
 
-def _held(run: Run, read: np.ndarray) -> dict[str, list[float]]:
-    error, spread = np.sqrt(((run.position - read) ** 2).mean(0)), run.position.std(0)
-    share = error / np.maximum(spread, 1e-12)
-    return {"rms": error.tolist(), "relative": share.tolist(), "r2": (1 - share**2).tolist()}
+def _held(here: Setting, run: Run, read: np.ndarray) -> dict[str, list[Any]]:
+    error = np.sqrt(((run.position - read) ** 2).mean(0))
+    shares = _shares(here, error, run.position)
+    return {"rms": error.tolist(), "relative": shares, "r2": [None if x is None else 1 - x**2 for x in shares]}
 
 
 def _left(here: Setting, rms: np.ndarray) -> list[str]:

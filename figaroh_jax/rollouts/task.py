@@ -229,6 +229,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
             *notes,
             *_kinds_note(loop, gain),
             *colour_notes(here),
+            *(f"{name}: {text}" for name, text in creeps.items()),
             *(_open_sizes(found) if named else ()),
             *(one_number_notes(found) if named else ()),
             *(_taken_gains(task, found) if named else ()),
