@@ -52,7 +52,7 @@ class Detent(fj.JointEffect):
 
 def run(
     hidden: list[tuple[str, int, float]], seed: int, noise: str, *, whole: bool, known: bool, forbid: bool = False,
-    holds: bool = False, recordings: int = 2,
+    holds: bool = False, recordings: int = 2, rest: str = "none",
 ) -> tuple[str, str, float]:  # fmt: skip
     """Verdict with its names, what was found, CPU seconds."""
     with tempfile.NamedTemporaryFile("w", suffix=".xml") as file:
@@ -61,7 +61,7 @@ def run(
         loop, _ = load_loop(file.name)
     runs = []
     for number in range(recordings):
-        r = servo_arm6.record(hidden, seed, number, noise, holds)
+        r = _recorded(hidden, seed, number, noise, holds, rest)
         runs.append(Run(f"run {number}", r["t"], r["u"], r["q"], None))
     cut = [Stretch(k, f, 600) for k in range(recordings) for f in range(0, 1200, 600)]
     start = time.process_time()
@@ -77,7 +77,8 @@ def run(
         silent = ("unknown", "named+rest") if found.creeps else ("unknown",)
         word = "wrong" if names else "right" if found.verdict in silent else "missed"
     elif not hidden:
-        word = "wrong" if names else "right" if found.verdict == ("named" if holds else "nothing") else "unknown"
+        due = "unknown" if rest != "none" else "named" if holds else "nothing"
+        word = "wrong" if names else "right" if found.verdict == due else found.verdict
     elif told == truth or (truth <= told | also and all(_true(n, truth) for n in causes)):
         word = "right"
     elif not told:
@@ -92,6 +93,26 @@ def run(
     proxy = "+".join(f"{n.candidate.effect}({', '.join(n.candidate.at)})" for n in found.proxy) or "-"
     levels = " -> ".join(f"{x:.3f}" for _, x in found.table)
     return word, f"{found.verdict} {names_text}, chi2/N {levels}, proxy {proxy}", time.process_time() - start
+
+
+def _recorded(
+    hidden: list[tuple[str, int, float]], seed: int, number: int, noise: str, holds: bool, rest: str
+) -> dict[str, np.ndarray]:
+    """A recording, with something beside that no effect explains: a notch, or friction of each recording's own."""
+    mine = [joint for _, joint, _ in hidden][:1]
+    rng = np.random.default_rng([seed, 19])
+    if rest == "notch" or (rest == "same" and not mine):
+        mine = [int(rng.choice([j for j in range(5) if j not in mine]))]
+    if rest in ("notch", "same"):
+        hidden = [*hidden, ("detent", mine[0], float(rng.choice(servo_arm6.DETENT)))]
+    if rest != "differ":
+        return servo_arm6.record(hidden, seed, number, noise, holds)
+    own, kept = np.random.default_rng([seed, number, 31]), (servo_arm6.FRICTION, servo_arm6.DAMPING)
+    servo_arm6.FRICTION, servo_arm6.DAMPING = (tuple(np.array(x) * (1 + 0.05 * own.standard_normal(6))) for x in kept)
+    try:
+        return servo_arm6.record(hidden, seed, number, noise, holds)
+    finally:
+        servo_arm6.FRICTION, servo_arm6.DAMPING = kept
 
 
 def _place(effect: str, joint: int) -> tuple[str, ...]:
@@ -132,6 +153,13 @@ def main() -> None:
     parser.add_argument("--forbid", action="store_true", help="leave the true effect out of the catalogue")
     parser.add_argument("--holds", action="store_true", help="the arm's friction holds, the file's creeps")
     parser.add_argument("--recordings", type=int, default=2)
+    parser.add_argument(
+        "--rest",
+        choices=["none", "notch", "same", "differ"],
+        default="none",
+        help="what no effect explains besides"
+        " (give four recordings): a notch at another joint, at the same, friction that differs by recording",
+    )
     parser.add_argument("--whole", action="store_true", help="one cause after another, as for other robots")
     args = parser.parse_args()
     count: dict[str, int] = {}
@@ -140,7 +168,7 @@ def main() -> None:
     for seed in args.seeds:
         for hidden in _cases(args, np.random.default_rng([seed, 3])):
             given: dict[str, Any] = {"whole": args.whole, "known": True, "forbid": args.forbid}
-            given |= {"holds": args.holds, "recordings": args.recordings}
+            given |= {"holds": args.holds, "recordings": args.recordings, "rest": args.rest}
             word, text, seconds = run(hidden, seed, args.noise, **given)
             count[word] = count.get(word, 0) + 1
             label = "+".join(f"{e}@{servo_arm6.NAMES[j]}:{size:g}" for e, j, size in hidden) or "none"
