@@ -186,6 +186,7 @@ class Diagnosis(Selection):
     prismatic: tuple[bool, ...] = ()  # per joint; empty: every joint is revolute
     band: float | None = None  # Hz, that positions were taken down to (`prepare`): predictions want the same
     of_positions: bool = False  # a rollout: residuals and traces are positions, not torques
+    remark: str = ""  # a sentence that the headline says besides what is missing
     refitted: tuple[str, ...] = ()  # numbers of the model file that the baseline's fit surely moved, in words
 
     @property

@@ -119,7 +119,9 @@ def test_the_exported_file_holds_in_mujoco(tmp_path: Path) -> None:
         np.testing.assert_allclose(q[::EVERY], ours[:, 0], atol=bound, rtol=0)
 
 
-def test_the_command_line_names_it_and_identify_fits_with_it(tmp_path: Path) -> None:
+def test_the_command_line_names_it_and_identify_fits_with_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Three recordings that friction holds in, by both commands; one held out moves, in the other the joint stands."""
     (tmp_path / "servo.xml").write_text(servo(friction=0.3, damping=0.2))
     runs = [recorded(servo(more=STIFF), k) for k in range(4)]
@@ -133,6 +135,7 @@ def test_the_command_line_names_it_and_identify_fits_with_it(tmp_path: Path) -> 
     task.write_text(json.dumps({"robot": {"model": "servo.xml"}, "data": roles}))
 
     assert main(["diagnose", str(task), "--out", str(tmp_path / "d"), "--quiet"]) == 0
+    assert "The robot's friction holds joints" in " ".join(capsys.readouterr().out.split())
     answer = json.loads((tmp_path / "d" / "answer.json").read_text())
     assert answer["verdict"] == "named"
     (cause,) = answer["causes"]

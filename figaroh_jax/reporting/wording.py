@@ -74,7 +74,7 @@ def sentence(diagnosis: Diagnosis, robot: str) -> str:
         found = f" Adding {_list(diagnosis.causes)} is not enough: {fall}." if diagnosis.causes else ""
         return f"{subject} has an error that no effect in the catalogue explains.{found}"
     rest = ". Part of the residual remains unexplained" if diagnosis.verdict == "named+rest" else ""
-    return f"{subject} is missing {_list(diagnosis.causes)}: {fall}{rest}."
+    return " ".join(filter(None, (f"{subject} is missing {_list(diagnosis.causes)}: {fall}{rest}.", diagnosis.remark)))
 
 
 def _once(refitted: Sequence[str]) -> str:

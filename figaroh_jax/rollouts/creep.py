@@ -30,8 +30,9 @@ from .setting import Setting, Structure, by_recording, largest_forces, thinned
 from .shared import t_together
 from .thresholds import CONFIDENT, GAIN, GAIN_BESIDE_REST, HOPEFUL, T_BESIDE_REST
 
-__all__ = ["creep_notes", "creep_speed", "fitted_with_both", "searched_with_both", "stiff"]
+__all__ = ["REMARK", "creep_notes", "creep_speed", "fitted_with_both", "searched_with_both", "stiff"]
 
+REMARK = "The robot's friction holds joints that the soft friction of the file lets creep."
 _FRICTION = "friction_loss"
 
 Seek = Callable[..., Search]

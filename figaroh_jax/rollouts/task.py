@@ -23,7 +23,7 @@ from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, Experiment, G
 from .alone import inseparable, separable
 from .arm import search_arm
 from .causes import BASELINE
-from .creep import creep_notes, searched_with_both
+from .creep import REMARK, creep_notes, searched_with_both
 from .data import Run, Stretch, ahead_of_command, noise_of, regular, windows
 from .fit import Fit
 from .loop import Loop, alike
@@ -236,6 +236,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
             *implausible(loop.robot, model, task.robot.trust),
             *_refitted_note(here, runs, refitted, found.verdict),
         ),
+        remark=REMARK if creeps else "",
         refitted=refitted,
         prismatic=tuple(j.kind == "prismatic" for j in loop.robot.joints if not j.follows),
         of_positions=True,
