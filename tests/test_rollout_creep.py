@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -11,13 +12,15 @@ import pytest
 from schema import matches
 
 from figaroh_jax.cli import main
+from figaroh_jax.rollouts.causes import catalogue, elastic_loop
 from figaroh_jax.rollouts.creep import creep_notes, creep_speed, searched_with_both, stiff
 from figaroh_jax.rollouts.data import Run
 from figaroh_jax.rollouts.export import described, with_drives
 from figaroh_jax.rollouts.loop import STIFFEST
+from figaroh_jax.rollouts.parameters import values
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import Search, search
-from figaroh_jax.rollouts.setting import Setting, setting
+from figaroh_jax.rollouts.search import Named, Search, search
+from figaroh_jax.rollouts.setting import Setting, Structure, setting
 from figaroh_jax.rollouts.task import simulated
 
 DT, EVERY, SECONDS = 0.002, 5, 12.0
@@ -84,6 +87,19 @@ def test_friction_that_holds_is_named_where_the_files_creeps(tmp_path: Path) -> 
     (note,) = creep_notes(here, found).values()
     assert "mrad/s" in note
     assert "solimpfriction 0.9999" in note
+
+
+def test_the_speed_is_told_where_a_joint_has_a_spring_too(tmp_path: Path) -> None:
+    """The loop with a spring has one coordinate more than the robot of the file."""
+    (tmp_path / "servo.xml").write_text(servo())
+    here = setting(load_loop(tmp_path / "servo.xml")[0], [recorded(servo(), 0)])
+    loop, table = elastic_loop(here.loop, 0, 100.0, 0.1), here.known.table
+    theta, friction = values(here.loop, table), catalogue(here.loop, np.ones(1)).candidates
+    (one,) = (Named(c, 4.0, 0.5, ()) for c in friction if c.effect == "friction_loss")
+    found = SimpleNamespace(creeps=[one], structure=(stiff(loop), table, None), last=SimpleNamespace(theta=theta))
+    found.structure = Structure(*found.structure)
+    (note,) = creep_notes(here, found).values()  # pyright: ignore[reportArgumentType]
+    assert f"{1e3 * creep_speed(here.loop)[0]:.2g} mrad/s" in note
 
 
 def test_friction_that_creeps_as_the_files_is_nothing(tmp_path: Path) -> None:

@@ -87,8 +87,7 @@ def fitted_with_both(here: Setting, first: Fit) -> tuple[Setting, Fit, tuple[str
     """The baseline's fit with friction that holds where recordings left out are surely predicted better by it, and
     what is said of that; else the fit as it is."""
     structure = Structure(here.loop, here.known.table, here.data)
-    creeps = here.loop.law == "soft" and bool(creep_speed(put(*structure[:2], first.theta)).any())
-    if not creeps or excess_of(here, structure, first).max() < 1.0:
+    if not _creeps(put(*structure[:2], first.theta)) or excess_of(here, structure, first).max() < 1.0:
         return here, first, ()
     some, held = thinned(here), replace(here, loop=stiff(here.loop))
     other = _fitted(held, structure._replace(loop=held.loop), first, here.baseline)
@@ -116,10 +115,14 @@ def _unit(loop: Loop, joint: int) -> str:
 def _is_asked(here: Setting, found: Search, forbid: Sequence[str]) -> bool:
     """Whether a rest is left by friction that creeps."""
     rest = found.verdict in ("unknown", "named+rest") and np.isfinite(found.last.cost)
-    if not rest or _FRICTION in forbid or here.loop.law != "soft":
+    if not rest or _FRICTION in forbid:
         return False
-    last = put(found.structure.loop, found.structure.table, found.last.theta)
-    return bool((creep_speed(last) > 2 * creep_speed(stiff(last))).any())
+    return _creeps(put(found.structure.loop, found.structure.table, found.last.theta))
+
+
+def _creeps(loop: Loop) -> bool:
+    """Whether a joint's friction would hold better if it were stiff."""
+    return loop.law == "soft" and bool((creep_speed(loop) > 2 * creep_speed(stiff(loop))).any())
 
 
 def _fitted(here: Setting, structure: Structure, last: Fit, free: Sequence[int]) -> Fit:
@@ -226,11 +229,8 @@ def creep_notes(here: Setting, found: Search) -> dict[Name, str]:
     if not found.creeps:
         return {}
     last: Any = put(found.structure.loop, found.structure.table, found.last.theta)
-    soft = eqx.tree_at(
-        lambda m: (m.joints.friction_share, m.joints.friction_rate), last,
-        (here.loop.joints.friction_share, here.loop.joints.friction_rate),
-    )  # fmt: skip
-    speed = creep_speed(soft)
+    own = [np.asarray(x)[: here.loop.robot.nv] for x in (last.joints.friction, last.joints.armature)]  # no spring's
+    speed = creep_speed(eqx.tree_at(lambda m: (m.joints.friction, m.joints.armature), here.loop, own))
     notes = dict[Name, str]()
     for one in found.creeps:
         j = joint_of(here, one.candidate)

@@ -82,13 +82,15 @@ def _parts(here: Setting, structure: Structure, c: Candidate) -> list[tuple[str,
     reading = np.asarray(structure.data.reading)[:, : len(measured)]
     blocks = len(reading) // rows
     position = reading[: blocks * rows].reshape(blocks, rows, *reading.shape[1:])
+    weight = np.asarray(structure.data.weight)[: blocks * rows].reshape(blocks, rows, -1, reading.shape[2])
+    counted = np.asarray((weight > 0).any((1, 2)))  # windows that end before others are filled up
     joints = [names.index(at) for at in c.at if at in names]
     joints = [j for j in joints if j in measured] or measured
     found = list[tuple[str, np.ndarray, float]]()
     for j in joints:
         own = position[:, :, measured.index(j)]
-        found.append((f"the position of {names[j]}", _fifths(own.mean(1)), STEADY[0]))
-        found.append((f"the speed of {names[j]}", _fifths(np.abs(np.diff(own, axis=1)).mean(1)), STEADY[0]))
+        found.append((f"the position of {names[j]}", _fifths(own.mean(1), counted), STEADY[0]))
+        found.append((f"the speed of {names[j]}", _fifths(np.abs(np.diff(own, axis=1)).mean(1), counted), STEADY[0]))
     count = reading.shape[2]
     time = np.arange(blocks) * _PARTS // blocks
     found.append(("time", np.broadcast_to(time[:, None], (blocks, count)), STEADY[1]))
@@ -98,8 +100,9 @@ def _parts(here: Setting, structure: Structure, c: Candidate) -> list[tuple[str,
     return found
 
 
-def _fifths(values: np.ndarray) -> np.ndarray:
-    return np.searchsorted(np.quantile(values, np.arange(1, _PARTS) / _PARTS), values)
+def _fifths(values: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """Which fifth of those that count each is in."""
+    return np.searchsorted(np.quantile(values[counted], np.arange(1, _PARTS) / _PARTS), values)
 
 
 class Normal:
