@@ -15,7 +15,7 @@ from figaroh_jax.cli import main
 from figaroh_jax.rollouts.causes import catalogue, elastic_loop
 from figaroh_jax.rollouts.creep import creep_notes, creep_speed, searched_with_both, stiff
 from figaroh_jax.rollouts.data import Run
-from figaroh_jax.rollouts.export import described, with_drives
+from figaroh_jax.rollouts.export import described, for_simulator, with_drives
 from figaroh_jax.rollouts.loop import STIFFEST
 from figaroh_jax.rollouts.parameters import values
 from figaroh_jax.rollouts.reading import load_loop
@@ -125,7 +125,14 @@ def test_the_exported_file_holds_in_mujoco(tmp_path: Path) -> None:
         model = mujoco.MjModel.from_xml_string(text)
         assert model.opt.iterations >= 100
         assert model.opt.ls_iterations >= 50
-        (tmp_path / "out.xml").write_text(text)
+        said = {
+            (name, part): [one["value"] for one in told[part] if one["number"] == "friction_impedance"]
+            for name in ("mujoco", "genesis", "gazebo")
+            for told in [for_simulator(described(loop), name)]
+            for part in ("values", "unsaid")
+        }
+        assert said.pop(("mujoco", "values")) == said.pop(("genesis", "unsaid")) == pytest.approx([STIFFEST])
+        assert not any(said.values())  # Gazebo's friction is Coulomb's
         data, u = mujoco.MjData(model), np.repeat(run.command[:, 0], EVERY)
         data.qpos[:], q = run.position[0], np.zeros(len(u))
         ours = simulated(loop, run._replace(position=np.full_like(run.position, run.position[0])))

@@ -26,6 +26,7 @@ _JOINT = ("armature", "damping", "friction", "stribeck_force", "stribeck_speed",
           "play", "offset", "ripple_sine", "ripple_cosine", "ripple_order", "reading", "friction_rate",
           "friction_share")  # fmt: skip
 _ITERATIONS = 100, 50  # of MuJoCo's solver and its line search, its own: with 10 and 20 stiff friction creeps again
+_SOFT, _IMPEDANCE, _NEAR = ("newton", "genesis"), 0.9, 0.01  # MuJoCo's friction as it is by default
 _FAR = 1e10  # what stands in an MJCF for a side without a limit
 
 
@@ -377,6 +378,12 @@ def for_simulator(content: dict[str, Any], name: str) -> dict[str, Any]:
         for number, value in numbers.items():
             if number != "rest" or numbers["stiffness"] != 0:  # without a spring nothing rests
                 say(place, number, value, UNITS.get(number, ""))
+        if numbers["friction"] > 0 and (content["law"] == "hard" or numbers.get("friction_rate", 0.0) > 0):
+            told = {"at": place, "number": "friction_impedance", "value": _friction_words(content, numbers)[0]}
+            if name == "mujoco":
+                values.append(told | {"word": "joint solimpfriction, its first two"})
+            elif name in _SOFT and abs(told["value"] - _IMPEDANCE) > _NEAR:
+                unsaid.append(told | {"unit": ""})
     for place, drive in content["drives"].items():
         told = drive if name == "mujoco" else _at_the_joint(drive)
         where = place if name == "mujoco" or len(_ways(drive)) > 1 else drive["joint"]
