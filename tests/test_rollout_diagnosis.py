@@ -17,7 +17,7 @@ from schema import matches
 from figaroh_jax.cli import main
 from figaroh_jax.errors import InputError
 from figaroh_jax.rollouts.causes import elastic_loop
-from figaroh_jax.rollouts.data import Run, Stretch, noise_of, regular, windows
+from figaroh_jax.rollouts.data import Run, Stretch, as_recorded, noise_of, regular, windows, without_gaps
 from figaroh_jax.rollouts.export import described, for_simulator, with_drives
 from figaroh_jax.rollouts.parameters import Entry, put
 from figaroh_jax.rollouts.reading import load_loop
@@ -149,6 +149,46 @@ def test_noise_is_found_under_a_motion_and_a_jump_of_the_clock_is_told():
     time[70:] += 0.08
     with pytest.raises(InputError, match="jumps in row 70"):
         regular("run.npz", time)
+
+
+def test_lost_and_late_rows_are_filled_in_and_count_for_nothing():
+    """Row 50 of a clock of 10 ms is lost, and from row 120 on all come 6 ms late; a gap of 80 ms is not filled."""
+    time = 0.01 * np.arange(400)
+    time[120:] += 0.006
+    kept = np.delete(np.arange(400), 50)
+    wave = np.sin(time)[:, None]
+    run = Run("run", time[kept], wave[kept], 2 * wave[kept], None)
+    new, said = without_gaps(run)
+    assert "late: 2 of 399, the first row 50 (from 0)" in said
+    np.testing.assert_allclose(np.diff(new.time), 0.01, atol=1e-12, rtol=0)
+    assert new.trusted is not None
+    assert np.flatnonzero(~new.trusted).tolist() == [50, 120]
+    np.testing.assert_array_equal(new.command[[50, 120]], wave[[49, 119]])
+    np.testing.assert_allclose(new.position[50], wave[49] + wave[51], atol=1e-12, rtol=0)
+    stamps, values = as_recorded(new, new.position)
+    np.testing.assert_array_equal(stamps, run.time)
+    np.testing.assert_array_equal(values, run.position)
+    gone = run._replace(time=run.time + 0.08 * (np.arange(399) >= 200))
+    assert without_gaps(gone) == (gone, "")
+    assert without_gaps(run._replace(time=0.01 * np.arange(399)))[1] == ""
+
+
+def test_a_recording_with_lost_rows_is_diagnosed_and_predicted_at_its_own_stamps(tmp_path: Path):
+    path = task(tmp_path, "none")
+    for file in tmp_path.glob("*.npz"):
+        with np.load(file) as z:
+            kept = np.delete(np.arange(len(z["t"])), [41, 300])
+            arrays = {name: z[name][kept] for name in z.files}
+        np.savez(file, **arrays)
+    assert main(["diagnose", str(path), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    answer = json.loads((tmp_path / "run" / "answer.json").read_text())
+    assert answer["verdict"] == "nothing"
+    assert any("rows that come late: 2 of" in note and "the first row 41" in note for note in answer["notes"])
+    with np.load(tmp_path / "run" / "predictions.npz") as told:
+        for name in [x.removesuffix("_time") for x in told.files if x.endswith("_time")]:
+            with np.load(tmp_path / f"{name}.npz") as z:
+                np.testing.assert_array_equal(told[f"{name}_time"], z["t"])
+                assert np.sqrt(np.mean((told[f"{name}_position"] - z["q"]) ** 2)) < 1e-3
 
 
 @pytest.mark.slow

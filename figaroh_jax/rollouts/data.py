@@ -15,8 +15,18 @@ from .loop import Loop
 from .sensitivity import Windows
 from .thresholds import AHEAD_LIKE, AHEAD_MORE, AHEAD_ROWS, AHEAD_SECONDS
 
-__all__ = ["Run", "Stretch", "ahead_of_command", "noise_of", "regular", "windows"]
+__all__ = [
+    "Run",
+    "Stretch",
+    "ahead_of_command",
+    "as_recorded",
+    "noise_of",
+    "regular",
+    "windows",
+    "without_gaps",
+]
 
+_GAP, _GAPS = 3.0, 0.01  # periods from a row to the next, and share of rows, up to which gaps are filled in
 _LEAD = 0.2  # s of command kept before a window: no delay is longer
 _KEPT = 0.97334  # variance of a normal variable that never leaves three sigma
 _SMOOTH = 0.99  # level of the squares left by a cubic, up to which it follows the rows
@@ -33,6 +43,8 @@ class Run(NamedTuple):
     holdout: bool = False
     trusted: np.ndarray | None = None  # (rows,) or (rows, ny), False: what counts for nothing
     carried: np.ndarray | None = None  # (rows, 4 + 3 links) of one joint alone: `alone.carried_by`
+    stamps: np.ndarray | None = None  # s, of the recording itself where rows were filled in
+    filled: np.ndarray | None = None  # (rows,) True: a row that was filled in
 
 
 class Stretch(NamedTuple):
@@ -55,6 +67,47 @@ def regular(name: str, time: np.ndarray) -> float:
             f"where the period is {period:.6g} s; cut the recording there, a rollout needs a regular clock"
         )
     return float((time[-1] - time[0]) / (len(time) - 1))
+
+
+def without_gaps(run: Run) -> tuple[Run, str]:
+    """A recording of which a few rows are lost or late, with rows that count for nothing in the gaps, and what is said.
+
+    The command holds through a gap, and the clock is that of the other rows: it is off by half a period at most for
+    each. What is not a few short gaps is left as it is, for `regular` to refuse.
+    """
+    steps = np.diff(run.time)
+    period = float(np.median(steps))
+    late = np.abs(steps - period) > 0.5 * period
+    if not late.any() or late.mean() > _GAPS or steps.max() > _GAP * period or steps.min() <= 0.5 * period:
+        return run, ""
+    period = float(steps[~late].mean())
+    row = np.concatenate([[0], np.cumsum(np.round(steps / period).astype(int))])
+    every = np.arange(row[-1] + 1)
+    filled = ~np.isin(every, row)
+    new = run._replace(
+        time=run.time[0] + period * every,
+        command=run.command[np.searchsorted(row, every, side="right") - 1],
+        position=_through(row, every, run.position),
+        velocity=None if run.velocity is None else _through(row, every, run.velocity),
+        trusted=~filled,
+        stamps=run.time,
+        filled=filled,
+    )
+    first, most = int(late.argmax()) + 1, 1e3 * (steps.max() - period)
+    return new, (
+        f"{run.name}: rows that come late: {late.sum()} of {len(run.time)}, the first row {first} (from 0), by at most"
+        f" {most:.3g} ms; the command is taken to hold, and rows that count for nothing are filled in: {filled.sum()}"
+    )
+
+
+def _through(row: np.ndarray, every: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (rows, columns) with straight lines through what is filled in."""
+    return np.stack([np.interp(every, row, one) for one in values.T], 1)
+
+
+def as_recorded(run: Run, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The recording's own stamps, and what was simulated of it (rows, joints) at them."""
+    return (run.time, values) if run.stamps is None or run.filled is None else (run.stamps, values[~run.filled])
 
 
 def ahead_of_command(command: Float[np.ndarray, " rows"], position: Float[np.ndarray, " rows"], period: float) -> int:

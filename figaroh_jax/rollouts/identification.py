@@ -14,7 +14,7 @@ from ..effects.plausibility import implausible
 from ..errors import InputError
 from ..results import Trace
 from .creep import fitted_with_both
-from .data import Run, Stretch, noise_of, windows
+from .data import Run, Stretch, as_recorded, noise_of, windows
 from .fit import Fit, System, fit, standard_errors
 from .loop import Loop
 from .own import is_own
@@ -80,7 +80,7 @@ def identify_rollout_task(
         result = _result(here, first, held, notes)
         progress("simulating the recordings", 0.9)
         traces = _traces(loop, final, runs)
-    predictions = {name: (run.time, read) for name, (run, read) in held.items()}
+    predictions = {name: as_recorded(run, read) for name, (run, read) in held.items()}
     straight = {name for j in loop.robot.joints if j.kind == "prismatic" for name in (j.name,)}
     joints = tuple(loop.robot.dof_names[k] for k in loop.measured)
     units = tuple("m" if name in straight else "rad" for name in joints)

@@ -24,7 +24,7 @@ from .alone import inseparable, separable
 from .arm import search_arm
 from .causes import BASELINE
 from .creep import REMARK, creep_notes, searched_with_both
-from .data import Run, Stretch, ahead_of_command, noise_of, regular, windows
+from .data import Run, Stretch, ahead_of_command, as_recorded, noise_of, regular, windows, without_gaps
 from .fit import Fit
 from .loop import Loop, alike
 from .own import left_out
@@ -109,19 +109,21 @@ def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
         )
     recordings = read_recordings(task, loop.robot, rollouts=True)
     warnings = check_rollouts(task, loop.robot, recordings)
-    runs = tuple(_run(loop, r) for r in recordings)
-    periods = {regular(str(r.file), r.time) for r in recordings}
+    runs, late = zip(*(_run(loop, r) for r in recordings), strict=True)
+    periods = {regular(str(r.file), run.time) for r, run in zip(recordings, runs, strict=True)}
     if max(periods) > 1.02 * min(periods):
         raise InputError(f"{task.file}: data: the periods of the recordings differ ({sorted(periods)} s)")
     period = float(np.mean(list(periods)))
     steps = max(1, int(np.ceil(period / float(loop.dt) - 1e-6)))
     loop = eqx.tree_at(lambda m: m.dt, loop, np.float64(period / steps))
     notes = [f"{task.robot.model.name}: not simulated: {note}" for note in left_out]
+    notes += [note for note in late if note]
     notes.append(f"simulated in steps of {1e3 * period / steps:.3g} ms, {steps} to a sample")
     return loop, runs, (*warnings, *notes)
 
 
-def _run(loop: Loop, recording: Recording) -> Run:
+def _run(loop: Loop, recording: Recording) -> tuple[Run, str]:
+    """A recording as a rollout takes it, and what is said of its clock."""
     if recording.command is None:
         raise InputError(f"{recording.file}: a rollout needs `command`")
     way = np.abs(np.asarray(loop.drives.transmission))
@@ -138,17 +140,19 @@ def _run(loop: Loop, recording: Recording) -> Run:
                 f" rad in row {row} (from 0), but the joint never leaves +-{reach:.3g} rad: is it in degrees or counts?"
                 " Say `units: {position: deg}`, or convert it to the unit of the position"
             )
-    _check_order(loop, recording, command[:, follows], columns[follows])
-    return Run(
-        recording.name, recording.time, command, recording.position, recording.velocity, recording.role == "holdout"
-    )
+    held_out = recording.role == "holdout"
+    run = Run(recording.name, recording.time, command, recording.position, recording.velocity, held_out)
+    run, late = without_gaps(run)
+    _check_order(loop, recording, run, follows, columns)
+    return run, late
 
 
-def _check_order(loop: Loop, recording: Recording, command: np.ndarray, columns: np.ndarray) -> None:
+def _check_order(loop: Loop, recording: Recording, run: Run, follows: np.ndarray, columns: np.ndarray) -> None:
     """Refuse a recording in which most joints that follow a command move before it does."""
-    period = regular(str(recording.file), recording.time)
-    moved = [(u, j) for u, j in zip(command.T, columns, strict=True) if np.ptp(u) and np.ptp(recording.position[:, j])]
-    ahead = {loop.robot.dof_names[j]: ahead_of_command(u, recording.position[:, j], period) for u, j in moved}
+    period, position = regular(str(recording.file), run.time), run.position
+    pairs = zip(run.command[:, follows].T, columns[follows], strict=True)
+    moved = [(u, j) for u, j in pairs if np.ptp(u) and np.ptp(position[:, j])]
+    ahead = {loop.robot.dof_names[j]: ahead_of_command(u, position[:, j], period) for u, j in moved}
     early = [name for name, rows in ahead.items() if rows]
     if 2 * len(early) > len(moved):
         raise InputError(
@@ -241,7 +245,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
         prismatic=tuple(j.kind == "prismatic" for j in loop.robot.joints if not j.follows),
         of_positions=True,
     )
-    predictions = {run.name: (run.time, held[run.name][1]) for run in runs if run.holdout}
+    predictions = {run.name: as_recorded(run, held[run.name][1]) for run in runs if run.holdout}
     return RolloutDiagnosis(diagnosis, final, predictions)
 
 
