@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
 from generators import servo_arm6
 
-from figaroh_jax.rollouts.arm import search_arm
+from figaroh_jax.rollouts.arm import as_sure_together, search_arm
 from figaroh_jax.rollouts.data import Run, Stretch
 from figaroh_jax.rollouts.gates import standing
 from figaroh_jax.rollouts.parameters import of_one_number, put, values
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import all_but
+from figaroh_jax.rollouts.search import Named, all_but
 from figaroh_jax.rollouts.setting import Setting, Structure, begun, setting
 from figaroh_jax.rollouts.shared import as_one_number, of_one_kind
+from figaroh_jax.rollouts.thresholds import T_BESIDE_REST
 
 SPEED = 0.1  # rad/s
 
@@ -82,6 +84,8 @@ def test_joints_of_one_kind_of_servo_have_one_number_together(tmp_path: Path, mo
     assert [c.at for c in ones] == [(name,) for name in servo_arm6.NAMES]
     named, new = as_one_number(here, now, ones)
     assert {n.candidate.at[0] for n in named} >= {"flex", "roll", "jaw"}
+    (t,) = {n.t for n in named}  # as sure as they are together
+    assert t > T_BESIDE_REST
     (entries,) = {n.candidate.entries for n in named}
     force, speed = new.model.fit.theta[list(entries)]
     assert force == pytest.approx(0.06, rel=0.1)
@@ -104,3 +108,20 @@ def test_joints_of_other_drives_have_numbers_of_their_own(tmp_path: Path):
     np.testing.assert_array_equal(
         np.asarray(put(here.loop, table, theta).joints.stribeck_force), [0.2, 0.2, 0, 0, 0, 0]
     )
+
+
+def test_what_three_joints_show_in_one_round_is_as_sure_as_they_are_together(tmp_path: Path):
+    """Each takes half of the squares of its joint, in all of four recordings; two joints are judged by themselves."""
+    here = arm_of(tmp_path / "arm.xml", [record(number, 0.0, 0.0) for number in range(4)])
+    ones = [c for c in here.known.candidates if c.effect == "stribeck_friction"]
+    shape = (len(here.folds), len(here.stretches), 6)
+    before = np.random.default_rng().uniform(0.9, 1.1, shape)
+    now, new = (SimpleNamespace(held=x) for x in (before, 0.5 * before**2))
+    named = [Named(c, 1.7, 0.5, ()) for c in ones]
+    told = as_sure_together(here, now, new, named[:3])  # pyright: ignore[reportArgumentType]
+    (t,) = {n.t for n in told}
+    assert t > T_BESIDE_REST
+    assert as_sure_together(here, now, new, named[:2]) == named[:2]  # pyright: ignore[reportArgumentType]
+    other = next(c for c in here.known.candidates if c.effect == "load_dependent_friction")
+    mixed = [*named[:3], Named(other, 1.7, 0.5, ())]
+    assert as_sure_together(here, now, new, mixed) == mixed  # pyright: ignore[reportArgumentType]

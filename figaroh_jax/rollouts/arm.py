@@ -32,7 +32,7 @@ from .steady import in_doubt
 from .table import on_table
 from .thresholds import FEWEST_JOINTS, NEAR, NO_CHOICE, T_BESIDE_REST, UNTOLD
 
-__all__ = ["alike_by_recording", "search_arm"]
+__all__ = ["alike_by_recording", "as_sure_together", "search_arm"]
 
 _AGAIN = 6  # iterations from the numbers of the model file
 _TOP, _CHECKS = 3, 4  # candidates told as the nearest; those whose held-out squares are looked at in a round
@@ -459,13 +459,13 @@ def _named(
         spare = needless(here, with_all, chosen) if len(chosen) > 1 else None
         if spare is None:
             named = [_name(here, now, with_all, one, lists, check) for one, check in zip(chosen, checks, strict=True)]
-            named = _as_sure_together(here, now, with_all, named)
+            named = as_sure_together(here, now, with_all, named)
             return sorted(named, key=lambda n: n.after**2 - n.before**2), with_all
         chosen = [one for one in chosen if one is not spare]
     return None
 
 
-def _as_sure_together(here: Setting, now: Standing, new: Standing, named: list[Named]) -> list[Named]:
+def as_sure_together(here: Setting, now: Standing, new: Standing, named: list[Named]) -> list[Named]:
     """What three joints or more turn out to have in one round is borne out by all of them."""
     alike = len({n.candidate.effect for n in named}) == 1 and len(named) >= FEWEST_JOINTS
     if not (alike and by_recording(here)):
