@@ -22,7 +22,7 @@ from .arm import alike_by_recording
 from .causes import Candidate, catalogue
 from .fit import Fit, fit
 from .gates import rms_of, standing
-from .loop import STIFFEST, Loop, mobility
+from .loop import STIFFEST, Loop, mobility, turns
 from .parameters import put
 from .screening import LATE, ROUGH, Standing, excess_of, joint_of
 from .search import Named, Search, t_of, t_of_recordings
@@ -109,7 +109,7 @@ def fitted_with_both(here: Setting, first: Fit) -> tuple[Setting, Fit, tuple[str
 
 
 def _unit(loop: Loop, joint: int) -> str:
-    return "mrad" if loop.robot.dofs.turns[np.argsort(loop.robot.dofs.column)][joint] else "mm"
+    return "mrad" if turns(loop)[joint] else "mm"
 
 
 def _is_asked(here: Setting, found: Search, forbid: Sequence[str]) -> bool:

@@ -41,6 +41,7 @@ __all__ = [
     "Step",
     "advance",
     "alike",
+    "turns",
     "integrated",
     "observe",
 ]
@@ -205,14 +206,19 @@ class Loop(eqx.Module):
         return found
 
 
+def turns(loop: Loop) -> np.ndarray:
+    """Whether each coordinate turns, (nv,)."""
+    return loop.robot.dofs.turns[np.argsort(loop.robot.dofs.column)]
+
+
 def alike(loop: Loop, *, slides: bool = False) -> np.ndarray:
     """Which of the measured joints one number counts, (measured,): those that turn, or that slide.
 
     All where no joint is of that kind: a number of rad and m together is neither.
     """
-    turns = loop.robot.dofs.turns[np.argsort(loop.robot.dofs.column)][list(loop.measured)]
-    wanted = ~turns if slides else turns
-    return wanted if wanted.any() else np.ones(len(turns), bool)
+    turning = turns(loop)[list(loop.measured)]
+    wanted = ~turning if slides else turning
+    return wanted if wanted.any() else np.ones(len(turning), bool)
 
 
 class State(NamedTuple):

@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from ..effects.base import joint_unit
 from . import own
-from .loop import Loop
+from .loop import Loop, turns
 
 __all__ = [
     "BOUNDS",
@@ -110,13 +110,13 @@ BOUNDS = _Known({  # what such a number can be
 
 def unit_of(loop: Loop, entry: Entry) -> str:
     """The unit of a number where it stands: N and m at a joint that slides, N m and rad at one that turns."""
-    unit, turns = UNITS[entry.name], loop.robot.dofs.turns[np.argsort(loop.robot.dofs.column)]
+    unit, turning = UNITS[entry.name], turns(loop)
     if entry.name in (*OF_SEVERAL, *TEN) or own.is_own(entry.name):
         return unit
     place = entry.at[0]
     if entry.name in OF_DRIVES:
         place = int(np.abs(np.asarray(loop.drives.transmission)[place]).argmax())
-    return joint_unit(unit, not turns[place])
+    return joint_unit(unit, not turning[place])
 
 
 def values(loop: Loop, table: Table) -> np.ndarray:

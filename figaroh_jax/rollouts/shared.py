@@ -19,6 +19,7 @@ import numpy as np
 from .causes import Candidate
 from .fit import Fit, fit
 from .gates import rms_of, standing
+from .loop import turns
 from .parameters import of_one_number, values
 from .screening import LATE, ROUGH, Standing, joint_of
 from .search import Named, Tried, sized, t_of_recordings
@@ -71,7 +72,7 @@ def of_one_kind(here: Setting, ones: Sequence[Candidate]) -> list[list[Candidate
     """Those of a family at joints that the file has alike: the same drive, which moves that joint alone, and the same
     numbers of it; joints that turn apart from those that slide, whose units are others."""
     drives, kinds = here.loop.drives, dict[tuple, list[Candidate]]()
-    turns = here.loop.robot.dofs.turns[np.argsort(here.loop.robot.dofs.column)]
+    turning = turns(here.loop)
     gear = np.abs(np.asarray(drives.transmission))
     stated = values(here.loop, here.known.table)
     for c in ones:
@@ -79,7 +80,7 @@ def of_one_kind(here: Setting, ones: Sequence[Candidate]) -> list[list[Candidate
         if len(mine) != 1 or np.count_nonzero(gear[mine[0]]) != 1:
             continue
         own = (
-            turns[joint_of(here, c)],
+            turning[joint_of(here, c)],
             gear[mine[0]].max(),
             *(np.asarray(x)[mine[0]] for x in (drives.gain, drives.bias, drives.force_range)),
         )

@@ -26,7 +26,7 @@ from .causes import BASELINE
 from .creep import REMARK, creep_notes, searched_with_both
 from .data import Run, Stretch, ahead_of_command, as_recorded, noise_of, regular, windows, without_gaps
 from .fit import Fit
-from .loop import Loop, alike
+from .loop import Loop, alike, turns
 from .own import left_out
 from .parameters import put, unit_of, values
 from .reading import load_loop
@@ -249,14 +249,9 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
     return RolloutDiagnosis(diagnosis, final, predictions)
 
 
-def _turns(loop: Loop) -> np.ndarray:
-    """Whether each coordinate turns, (nv,)."""
-    return loop.robot.dofs.turns[np.argsort(loop.robot.dofs.column)]
-
-
 def all_slide(loop: Loop) -> bool:
     """Whether every measured joint slides, so that positions are lengths."""
-    return not _turns(loop)[list(loop.measured)].any()
+    return not turns(loop)[list(loop.measured)].any()
 
 
 def _refitted(here: Setting, found: Search | None, model: tuple[Structure, Fit]) -> tuple[str, ...]:
@@ -375,7 +370,7 @@ def colour_notes(here: Setting) -> tuple[str, ...]:
 def _slides(loop: Loop, at: Sequence[str]) -> bool:
     """Whether what stands at these places is about a joint that slides; without a joint, whether all do."""
     j = loop.robot.dof_names.index(at[0]) if at and at[0] in loop.robot.dof_names else -1
-    return bool(not _turns(loop)[j]) if j >= 0 else all_slide(loop)
+    return bool(not turns(loop)[j]) if j >= 0 else all_slide(loop)
 
 
 def _mixed(loop: Loop) -> bool:
