@@ -29,6 +29,7 @@ from generators import servo_arm6
 
 import figaroh_jax as fj
 from figaroh_jax.rollouts.arm import search_arm
+from figaroh_jax.rollouts.bodies import searched_with_bodies
 from figaroh_jax.rollouts.creep import searched_with_both
 from figaroh_jax.rollouts.data import Run, Stretch
 from figaroh_jax.rollouts.reading import load_loop
@@ -66,8 +67,11 @@ def run(
     cut = [Stretch(k, f, 600) for k in range(recordings) for f in range(0, 1200, 600)]
     start = time.process_time()
     left_out = tuple(effect for effect, _, _ in hidden) if forbid else ()
+    left_out += ("link_inertia",) if "payload" in left_out else ("payload",) if "link_inertia" in left_out else ()
     here = setting(loop, runs, gains_known=known, stretches=cut, forbid=left_out)
-    found = searched_with_both(search if whole else search_arm, here, forbid=left_out)
+    seek = search if whole else search_arm
+    found = searched_with_both(seek, here, forbid=left_out)
+    found = searched_with_bodies(seek, here, found, forbid=left_out)
     causes = [n for n in found.named if not (holds and n in found.creeps)]
     names = {(n.candidate.effect, *n.candidate.at) for n in causes}
     alike = {(a.effect, *a.at) for n in causes for a in n.alike}
@@ -117,13 +121,18 @@ def _recorded(
 
 def _place(effect: str, joint: int) -> tuple[str, ...]:
     """Where a hidden effect is to be named."""
-    own = {"payload": ("payload",), "gravity_tilt": (), "coupled_transmission": servo_arm6.NAMES[joint : joint + 2]}
+    own = {
+        "payload": ("payload",),
+        "link_inertia": ("link_inertia",),
+        "gravity_tilt": (),
+        "coupled_transmission": servo_arm6.NAMES[joint : joint + 2],
+    }
     return tuple(own.get(effect, (servo_arm6.NAMES[joint],)))
 
 
 def _any_link(name: tuple[str, ...]) -> tuple[str, ...]:
-    """A payload may be named at any link: the arm's last ones move alike."""
-    return ("payload", "payload") if name[0] == "payload" else name
+    """A payload and a wrong link may be named at any link: those next to each other move alike."""
+    return (name[0], name[0]) if name[0] in ("payload", "link_inertia") else name
 
 
 def _text(name: tuple[str, ...]) -> str:
@@ -180,6 +189,8 @@ def _cases(args: argparse.Namespace, rng: np.random.Generator) -> list[list[tupl
     def one(effect: str, size: int) -> tuple[str, int, float]:
         sprung = effect in ("joint_elasticity", "backlash")  # the wrist's roll is too light for a spring at 2 ms
         joint = 5 if effect == "payload" else int(rng.integers(0, 4 if sprung else 5))
+        if effect == "link_inertia":  # gravity shows it
+            joint = int(rng.integers(1, 4))
         if effect in ("torque_ripple", "coupled_transmission"):  # the roll and the jaw do not move far enough
             joint = int(rng.integers(0, 4))
         return effect, joint, (servo_arm6.EFFECTS | servo_arm6.MORE)[effect][size]

@@ -49,6 +49,13 @@ class LinkInertia(LinkEffect):
     needs_trust = 0.05  # ten free parameters of a link make up for many a misfit
     equation = "W_k dpi_k, dpi_k free"
     separated_by = "the same motion with {at} disconnected or weighed"
+    in_rollouts = InRollouts(
+        (("mass", "mass"), ("mx", "mass_x"), ("my", "mass_y"), ("mz", "mass_z"),
+         ("ixx", "inertia_xx"), ("ixy", "inertia_xy"), ("iyy", "inertia_yy"), ("ixz", "inertia_xz"),
+         ("iyz", "inertia_yz"), ("izz", "inertia_zz")),
+        lambda scale: ((0.0,) * 10,), "link", several=True, together=10, last=True,
+        experiment="the same motion with {at} disconnected or weighed",
+    )  # fmt: skip
 
 
 @register

@@ -46,6 +46,7 @@ class InRollouts(NamedTuple):
     experiment: str = ""  # that tells it from others; none: `separated_by`
     shapes: tuple[int, ...] = ()  # numbers that show nothing without a size: each start is asked
     gains_free: bool = False  # looked for only where the gains of the drives are not known
+    last: bool = False  # looked for only where all others leave a rest
 
     def holds(self, other: str) -> bool:
         """Whether it can imitate another effect."""

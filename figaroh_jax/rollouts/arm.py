@@ -32,7 +32,7 @@ from .steady import in_doubt
 from .table import on_table
 from .thresholds import FEWEST_JOINTS, NEAR, NO_CHOICE, T_BESIDE_REST, UNTOLD
 
-__all__ = ["alike_by_recording", "as_sure_together", "search_arm"]
+__all__ = ["alike_by_recording", "as_sure_together", "baseline_alone", "search_arm"]
 
 _AGAIN = 6  # iterations from the numbers of the model file
 _TOP, _CHECKS = 3, 4  # candidates told as the nearest; those whose held-out squares are looked at in a round
@@ -234,6 +234,16 @@ def alike_by_recording(here: Setting, now: Standing) -> tuple[Standing, np.ndarr
     return Standing(model, outputs(here, last.sums.cost), now.held, beyond), spread
 
 
+def baseline_alone(here: Setting, found: Search) -> None:
+    """The fit of the baseline is what stands where no cause has a name; each recording tells as much of it."""
+    structure = Structure(here.loop, here.known.table, here.data)
+    beyond = excess_of(here, structure, found.first)
+    now = standing(here, structure, found.first, here.baseline, held=False)._replace(excess=beyond)
+    if by_recording(here):
+        now, found.spread = alike_by_recording(here, now)
+    found.structure, found.last = structure, now.model.fit
+
+
 def _quarters(here: Setting, structure: Structure) -> np.ndarray:
     """Which quarter of its recording each block and window is in, (blocks, windows)."""
     blocks = np.arange(structure.data.reading.shape[0] // structure.data.block)[:, None] * structure.data.block
@@ -369,6 +379,9 @@ def _round(
     if not lists:
         return [], now, nearest
     springs = _springs_first(here, now, tried, found, forbid)
+    for one in springs:  # a spring at one joint stands in for that of the next, whose own encoder hardly shows it
+        if (j := joint_of(here, one.candidate)) in known:
+            lists.setdefault(j, []).append(one)
     sprung = _spring_alone(here, now, tried, springs, found)
     if sprung is not None:
         return *sprung, nearest
@@ -450,6 +463,8 @@ def _named(
         new = _together(here, now, chosen)
         if not found or any(one.candidate.kind.elastic for one in chosen):
             new = _again(here, new, [n.candidate for n in found])
+        if not np.isfinite(new.fit.cost):
+            return None
         with_all = standing(here, new.structure, new.fit, new.free)
         checks = [checked(here, now, with_all, one) for one in chosen]
         keep = [one for one, (good, _, _) in zip(chosen, checks, strict=True) if good]

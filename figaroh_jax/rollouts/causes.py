@@ -16,9 +16,19 @@ from ..effects.loops import InRollouts, Scale
 from ..rigid.model import Frame, Joint, RobotModel
 from .loop import Joints, Loop, Pairs
 from .own import is_own, starts_of
-from .parameters import Entry, Table
+from .parameters import TEN, Entry, Table
 
-__all__ = ["BASELINE", "Candidate", "Catalogue", "catalogue", "elastic_loop", "kind_of", "springs", "with_pairs"]
+__all__ = [
+    "BASELINE",
+    "Candidate",
+    "Catalogue",
+    "catalogue",
+    "elastic_loop",
+    "elastic_table",
+    "kind_of",
+    "springs",
+    "with_pairs",
+]
 
 _JOINT_ENTRIES = (
     "armature", "damping", "friction", "stribeck_force", "stribeck_speed", "load_ratio", "stiffness",
@@ -76,11 +86,17 @@ class Catalogue(NamedTuple):
         return next(k for k, e in enumerate(self.table) if e.name == name and place in e.at)
 
 
-def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbid: Sequence[str] = ()) -> Catalogue:
-    """The candidates of a loop; `forces` (nu,) are the largest that its drives gave in the recordings."""
+def catalogue(
+    loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbid: Sequence[str] = (), bodies: Sequence[int] = ()
+) -> Catalogue:
+    """The candidates of a loop; `forces` (nu,) are the largest that its drives gave in the recordings.
+
+    What is looked for last stands in it at the links `bodies` alone, whose ten numbers end the table.
+    """
     robot, names = loop.robot, loop.robot.dof_names
     table, candidates = list[Entry](), list[_Wanted]()
-    kinds = {called: kind_of(effect) for called, effect in ROLLOUTS.items() if called not in forbid}
+    every = {called: kind_of(effect) for called, effect in ROLLOUTS.items() if called not in forbid}
+    kinds = {called: kind for called, kind in every.items() if not kind.last}
     levers = np.asarray(loop.joints.friction)
     for j, name in enumerate(names):
         read = j in loop.measured
@@ -111,6 +127,10 @@ def catalogue(loop: Loop, forces: np.ndarray, *, gains_known: bool = True, forbi
             candidates.append(
                 _Wanted(effect.name, (names[effect.places[0]],), own, starts_of(type(effect)), tuple(ordered))
             )
+    for i in bodies:
+        table += [Entry(number, (i,)) for number in TEN]
+        last = {called: kind for called, kind in every.items() if kind.last}
+        candidates += _wanted(last, "link", (robot.joints[i].link,), i, Scale(0.0, 0.0))
     index = {(e.name, e.at[0]): k for k, e in enumerate(table)}
     built = [
         Candidate(one.effect, one.at, tuple(index[e] for e in one.entries), one.starts, one.reported)
@@ -191,6 +211,16 @@ def elastic_loop(loop: Loop, coordinate: int, stiffness: float, damping: float) 
     )
     joints, start = _with_spring(loop.joints, stiffness, damping), np.append(np.asarray(loop.start), 0.0)
     return replace(loop, robot=_with_motor(robot, i), drives=drives, joints=joints, start=start, linear=None)
+
+
+def elastic_table(loop: Loop, table: Table, coordinate: int) -> Table:
+    """The table in `elastic_loop` of a loop, and the three numbers of the spring: links behind the motor come later."""
+    i = next(i for i, joint in enumerate(loop.robot.joints) if joint.coordinate == coordinate)
+    of_links = ("payload", *TEN)
+    moved = [
+        entry._replace(at=tuple(k + (k >= i) for k in entry.at)) if entry.name in of_links else entry for entry in table
+    ]
+    return (*moved, *(Entry(name, (loop.robot.nv,)) for name in ("stiffness", "damping", "play")))
 
 
 def _with_motor(robot: RobotModel, i: int) -> RobotModel:

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from ..results import Name
-from .arm import alike_by_recording
+from .arm import baseline_alone
 from .causes import Candidate, catalogue
 from .fit import Fit, fit
 from .gates import rms_of, standing
@@ -183,7 +183,7 @@ def _better(here: Setting, found: Search, other: Search) -> Search:
     if t < T_BESIDE_REST or (rest and np.mean([one.gain for one in told]) < GAIN_BESIDE_REST):
         return found
     if other.verdict == "unknown":
-        _without_causes(sound, other)
+        baseline_alone(sound, other)
     there = {joint_of(here, n.candidate): n for n in other.named if n.candidate.effect == _FRICTION}
     baseline = {joint_of(here, c): c for c in _frictions(here) if set(c.entries) <= set(other.last.free)}
     named = [
@@ -206,16 +206,6 @@ def _better(here: Setting, found: Search, other: Search) -> Search:
         held=[found.held[0], *other.held],
         setting=replace(sound, loop=here.loop),
     )
-
-
-def _without_causes(here: Setting, other: Search) -> None:
-    """The fit of the baseline is what stands where no other cause has a name; each recording tells as much of it."""
-    structure = Structure(here.loop, here.known.table, here.data)
-    beyond = excess_of(here, structure, other.first)
-    now = standing(here, structure, other.first, here.baseline, held=False)._replace(excess=beyond)
-    if by_recording(here):
-        now, other.spread = alike_by_recording(here, now)
-    other.structure, other.last = structure, now.model.fit
 
 
 def _frictions(here: Setting) -> list[Candidate]:

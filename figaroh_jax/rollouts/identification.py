@@ -10,15 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..effects.catalogue import ROLLOUTS
 from ..effects.plausibility import implausible
 from ..errors import InputError
+from ..estimation.consistency import inconsistencies
 from ..results import Trace
+from .bodies import EFFECT, identified
 from .creep import fitted_with_both
 from .data import Run, Stretch, as_recorded, noise_of, windows
 from .fit import Fit, System, fit, standard_errors
 from .loop import Loop
 from .own import is_own
-from .parameters import BOUNDS, OF_DRIVES, put, unit_of
+from .parameters import BOUNDS, OF_DRIVES, TEN, put, unit_of
 from .sensitivity import predicted
 from .setting import Setting, Structure, begun, coloured, residuals
 from .task import all_slide, colour_notes, diagnosis_setting, diverged, extended_of, read_rollouts, simulated
@@ -72,11 +75,18 @@ def identify_rollout_task(
         first = begun(here)
         if not np.isfinite(first.cost):
             raise InputError(f"{task.robot.model}: {diverged(here, first)}")
+        here, first, links = identified(here, first)
         here, first, more = fitted_with_both(here, first)
         here, first = _by_colour(here, first)
         final = put(here.loop, here.known.table, first.theta)
         held = {run.name: (run, simulated(final, run)) for run in runs if run.holdout}
-        notes = (*notes, *more, *colour_notes(here), *implausible(loop.robot, extended_of(final), task.robot.trust))
+        notes = (
+            *notes,
+            *links,
+            *more,
+            *colour_notes(here),
+            *implausible(loop.robot, extended_of(final), task.robot.trust),
+        )
         result = _result(here, first, held, notes)
         progress("simulating the recordings", 0.9)
         traces = _traces(loop, final, runs)
@@ -136,7 +146,7 @@ def _result(
         "rank": sum(p["status"] == "identified" for p in parameters),
         "condition": float(np.sqrt(singular[0] / max(singular[-1], 1e-300))),
         "base_parameters": parameters,
-        "links": [],
+        "links": _links(here, first),
         "effects": [],
         "fit": {
             "rms": rms.tolist(),
@@ -147,6 +157,17 @@ def _result(
         "notes": [*notes, *_left(here, rms), *_trades([names[free.index(k)] for k in told], correlation)],
         "unit": "m" if all_slide(here.loop) else "rad",
     }
+
+
+def _links(here: Setting, first: Fit) -> list[dict[str, Any]]:
+    """The ten parameters of the links that were fitted, in the frame of their joints (kg, kg m, kg m2)."""
+    robot = put(here.loop, here.known.table, first.theta).robot
+    places = sorted({e.at[0] for k, e in enumerate(here.known.table) if k in here.baseline and e.name in TEN})
+    ten, names = np.asarray(robot.inertia), robot.link_names
+    return [
+        {"name": names[i], "parameters": ten[i].tolist(), "consistent": not inconsistencies(ten[[i]], [names[i]])}
+        for i in places
+    ]
 
 
 def _expression(here: Setting, entry: int) -> str:
@@ -160,6 +181,9 @@ def _expression(here: Setting, entry: int) -> str:
         return f"{one.name} {', '.join(names[k] for k in here.loop.effects[place].places)}"
     if one.name in OF_DRIVES:
         place = int(np.abs(np.asarray(here.loop.drives.transmission)[place]).argmax())
+    if one.name in TEN:
+        told = {number: name for name, number in ROLLOUTS[EFFECT].in_rollouts.numbers}
+        return f"{told[one.name]} {here.loop.robot.link_names[place]}"
     return f"{one.name} {here.loop.robot.link_names[place] if one.name == 'payload' else names[place]}"
 
 

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from .causes import Candidate, elastic_loop, springs
+from .causes import Candidate, elastic_loop, elastic_table, springs
 from .fit import Fit, fit
 from .loop import Loop
 from .own import is_own
-from .parameters import OF_DRIVES, OF_SEVERAL, Entry, values
+from .parameters import OF_DRIVES, OF_SEVERAL, values
 from .search import Model, Tried, scored, settled
 from .sensitivity import Windows
 from .setting import (  # fmt: skip
@@ -418,8 +418,7 @@ def _sprung(here: Setting, now: Standing, joint: int, forbid: Sequence[str]) -> 
     if not wanted or not np.isfinite(torque):
         return []
     loop = elastic_loop(here.loop, joint, 10.0 * torque, 0.01 * torque)
-    n = here.loop.robot.nv
-    table = (*here.known.table, *(Entry(x, (n,)) for x in ("stiffness", "damping", "play")))
+    table = elastic_table(here.loop, here.known.table, joint)
     structure = Structure(loop, table, here.cut(loop))
     part, _, which = _part(now, joint)
     small = structure._replace(data=_only(structure.data, which))

@@ -11,11 +11,11 @@ import numpy as np
 from scipy.special import gammainccinv, ndtr
 
 from ..results import Name, Verdict
-from .causes import Candidate, elastic_loop, springs
+from .causes import Candidate, elastic_loop, elastic_table, springs
 from .colour import colour_of
 from .faults import Fault
 from .fit import Fit, System, fit, held_out, refitted_without, spread_of_recordings, standard_errors
-from .parameters import Entry, values
+from .parameters import values
 from .setting import (
     Setting,
     Structure,
@@ -417,8 +417,7 @@ def _elastic(here: Setting, now: Model, forbid: Sequence[str]) -> list[Tried]:
     n = here.loop.robot.nv
     torque = float(largest_forces(here.loop, here.runs).max())
     loop = elastic_loop(here.loop, 0, 10.0 * torque, 0.01 * torque)
-    extra = tuple(Entry(name, (n,)) for name in ("stiffness", "damping", "play"))
-    table = (*here.known.table, *extra)
+    table = elastic_table(here.loop, here.known.table, 0)
     structure = Structure(loop, table, here.cut(loop))
     base = np.concatenate([now.fit.theta, [0.0, 0.0, 0.0]])
     k = len(here.known.table)

@@ -121,10 +121,12 @@ def setting(
     stretches = tuple(stretches) or tuple(Stretch(k, 0, len(r.time)) for k, r in enumerate(fitted))
     data = windows(loop, fitted, stretches, noise, block)
     forces = largest_forces(loop, fitted)
-    known = catalogue(loop, forces, gains_known=gains_known, forbid=forbid)
+    links = loop.robot.link_names
+    bodies = [links.index(one[1]) for one in more if one[0] == "link_inertia" and one[1:] and one[1] in links]
+    known = catalogue(loop, forces, gains_known=gains_known, forbid=forbid, bodies=bodies)
     names = loop.robot.dof_names
     wanted = [(effect, name) for effect in baseline for name in names] + list(more)
-    all_of = catalogue(loop, forces, gains_known=False).candidates
+    all_of = catalogue(loop, forces, gains_known=False, bodies=bodies).candidates
     told = {(c.effect, *c.at) for c in all_of}
     for effect, *at in more:
         if effect == "coupled_transmission":

@@ -22,7 +22,7 @@ from .setting import Setting, Structure
 from .sizes import least_sure, why_nothing
 from .thresholds import STEADY
 
-__all__ = ["Normal", "in_doubt"]
+__all__ = ["Normal", "in_doubt", "most_unsteady"]
 
 _PARTS = 5  # of the positions, speeds and the time
 _SMALL = 1e-9  # of a column's squares, that keeps a direction without data from mattering
@@ -64,6 +64,16 @@ def _least_steady(here: Setting, structure: Structure, last: Fit, causes: Sequen
     told = [one for c in asked for one in _unsteadiness(here, structure, last, c)]
     worst = max(told, key=lambda one: one.share / one.least, default=None)
     return worst if worst is not None and worst.share > worst.least else None
+
+
+def most_unsteady(here: Setting, structure: Structure, last: Fit, cause: Candidate) -> tuple[str, float]:
+    """By what the size of a cause differs the most, and what sizes of its own would explain over what the cause does.
+
+    Nothing where the fit has no size of it.
+    """
+    told = _unsteadiness(here, structure, last, cause)
+    worst = max(told, key=lambda one: one.share, default=None)
+    return ("", 0.0) if worst is None else (worst.by, worst.share)
 
 
 def _unsteadiness(here: Setting, structure: Structure, last: Fit, c: Candidate) -> list[_Unsteady]:

@@ -22,6 +22,7 @@ from ..recordings.dataset import Recording, read_recordings
 from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, Experiment, Gain, Name, Rest, Trace, Verdict
 from .alone import inseparable, separable
 from .arm import search_arm
+from .bodies import body_notes, searched_with_bodies
 from .causes import BASELINE
 from .creep import REMARK, creep_notes, searched_with_both
 from .data import Run, Stretch, ahead_of_command, as_recorded, noise_of, regular, windows, without_gaps
@@ -87,6 +88,7 @@ def diagnose_rollout_task(
         if loop.robot.nv > 1 and seek is search:
             progress(f"looking for one cause after another, which takes long: {inseparable(loop)}", 0.0)
         found = searched_with_both(seek, here, progress, forbid=task.diagnose.forbid)
+        found = searched_with_bodies(seek, here, found, progress, forbid=task.diagnose.forbid)
         if not np.isfinite(found.first.cost):
             raise InputError(f"{task.robot.model}: {diverged(here, found.first)}")
         progress("measuring the gain", 0.9)
@@ -213,9 +215,10 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
     traces = _traces(here, runs, first, found, last, held)
     refitted = _refitted(here, found if named else None, last)
     creeps = creep_notes(here, found) if named else {}
+    told = creeps | body_notes(here, found) if named else {}
     diagnosis = Diagnosis(
         verdict=_verdict(found),
-        causes=(*_faulty(found, here), *(_cause(one, found, here, creeps) for one in (found.named if named else ()))),
+        causes=(*_faulty(found, here), *(_cause(one, found, here, told) for one in (found.named if named else ()))),
         p_value=found.p_value,
         joints=tuple(loop.robot.dof_names[k] for k in loop.measured),
         before=before,
@@ -233,7 +236,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
             *notes,
             *_kinds_note(loop, gain),
             *colour_notes(here),
-            *(f"{name}: {text}" for name, text in creeps.items()),
+            *(f"{name}: {text}" for name, text in told.items()),
             *(_open_sizes(found) if named else ()),
             *(one_number_notes(found) if named else ()),
             *(_taken_gains(task, found) if named else ()),
@@ -406,7 +409,7 @@ def _kinds_note(loop: Loop, gain: Gain) -> tuple[str, ...]:
     return (f"the error in {gain.unit} is that of the joints that {kind}: {', '.join(names)}",)
 
 
-def _cause(one: Named, found: Search, here: Setting, creeps: dict[Name, str]) -> Cause:
+def _cause(one: Named, found: Search, here: Setting, told: dict[Name, str]) -> Cause:
     structure, fitted = found.structure, found.last
     errors = told_errors(structure, fitted, found.spread)
     parameters = {}
@@ -432,7 +435,7 @@ def _cause(one: Named, found: Search, here: Setting, creeps: dict[Name, str]) ->
     name, at = Name(one.candidate.effect, one.candidate.at), one.candidate.at
     sure = 1.0 / (1 + len(one.alike)) * (0.98 if found.verdict == "named" else 0.8)
     gain = Gain(one.before, one.after, "m" if _slides(here.loop, at) else "rad")
-    return Cause(name, parameters, sure, gain, one.alike, note=creeps.get(name, one.candidate.kind.looks_like))
+    return Cause(name, parameters, sure, gain, one.alike, note=told.get(name, one.candidate.kind.looks_like))
 
 
 def _open_sizes(found: Search) -> list[str]:

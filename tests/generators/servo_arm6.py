@@ -27,6 +27,7 @@ MORE = {  # effects of torque level that act on joints; three sizes each
     "torque_ripple": (0.05, 0.12, 0.3),  # N m, 13.7 times a turn and .9 rad late
     "gravity_tilt": (0.01, 0.03, 0.08),  # rad, about x; half of it about y
     "coupled_transmission": (0.3, 0.6, 1.0),  # of a joint's armature, damping and friction, by a tendon to the next one
+    "link_inertia": (0.015, 0.03, 0.06),  # m by which the link's centre of mass lies further out
 }
 ORDER, PHASE = 13.7, 0.9
 DETENT = (0.1, 0.25, 0.6)  # N m: no effect of the library's
@@ -45,7 +46,7 @@ NAMES = ("pan", "lift", "elbow", "flex", "roll", "jaw")
 
 def model_text(
     scale: float = 1.0, payload: float = 0.0, spring: int = -1, tilt: float = 0.0,
-    coupled: tuple[int, float] = (0, 0.0), holds: bool = False,
+    coupled: tuple[int, float] = (0, 0.0), holds: bool = False, moved: tuple[int, float] = (0, 0.0),
 ) -> str:  # fmt: skip
     """The arm as an MJCF file; `spring`: a hinge between motor and link of that joint; `holds`: its friction is stiff."""
     held = f' solreffriction="{2 * DT} 1" solimpfriction="0.9999 0.9999"' if holds else ""
@@ -56,7 +57,7 @@ def model_text(
         mass = MASS[k] + (payload if k == 5 else 0.0)
         half = LENGTH[k] / 2
         size = MASS[k] * LENGTH[k] ** 2 / 12 + 1e-5
-        link = f'<inertial pos="0.01 0 {half:.4f}" mass="{mass:.6g}" diaginertia="{size:.6g} {size:.6g} {size / 3 + 1e-6:.6g}"/>'
+        link = f'<inertial pos="{0.01 + (moved[1] if k == moved[0] else 0.0):.6g} 0 {half:.4f}" mass="{mass:.6g}" diaginertia="{size:.6g} {size:.6g} {size / 3 + 1e-6:.6g}"/>'
         place = "0 0 0.05" if k == 0 else f"0 0 {LENGTH[k - 1]:.4f}"
         if k == spring:
             body += f'<body pos="{place}">{own}<inertial pos="0 0 0" mass="1e-4" diaginertia="1e-7 1e-7 1e-7"/><body><joint name="spring" axis="{AXIS[k]}"/>{link}'
@@ -92,7 +93,7 @@ def record(
     sprung = next((what[k][0] for k in ("joint_elasticity", "backlash") if k in what), -1)
     text = model_text(
         payload=what.get("payload", (5, 0.0))[1], spring=sprung, tilt=what.get("gravity_tilt", (0, 0.0))[1],
-        coupled=what.get("coupled_transmission", (0, 0.0)), holds=holds,
+        coupled=what.get("coupled_transmission", (0, 0.0)), holds=holds, moved=what.get("link_inertia", (0, 0.0)),
     )  # fmt: skip
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)

@@ -1,0 +1,504 @@
+"""Whether the masses and inertias of a robot's file are wrong, asked where a search ends beside a rest.
+
+Ten numbers of a link make up for many a misfit, so they are asked last, link after link, and only those numbers that
+the recordings tell to a share of the link's own size. A link is named where recordings left out are surely predicted
+better, and where a body can have what was found: numbers that imitate another effect seldom are those of one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from ..effects.catalogue import ROLLOUTS
+from ..errors import InputError
+from ..estimation.conic import Constraints, NotConverged, constrained
+from ..estimation.consistency import bodies, inconsistencies, project
+from ..estimation.priors import rigid_prior
+from ..results import Name
+from ..rigid.inertia import from_com
+from .arm import baseline_alone
+from .causes import Candidate, Catalogue, catalogue
+from .fit import Fit, System, fit
+from .gates import rms_of, standing
+from .loop import Loop
+from .parameters import TEN, put, values
+from .screening import Standing, excess_of
+from .search import Model, Named, Search, t_of, t_of_recordings
+from .setting import Setting, Structure, by_recording, free_entries, largest_forces, thinned
+from .steady import most_unsteady
+from .thresholds import (
+    BODY,
+    GAIN,
+    GAIN_BESIDE_REST,
+    MOST_OF_A_REST,
+    STEADY_OF_A_LINK,
+    T_BESIDE_REST,
+    T_WITHOUT_REST,
+    TOLD_OF_A_LINK,
+)
+
+__all__ = ["EFFECT", "body_notes", "identified", "searched_with_bodies"]
+
+EFFECT = "link_inertia"
+_LOOKS = 4  # at most, at which numbers are told
+_NO_OTHER = 1e-5  # of what a number does: what others cannot do as well, where it is one of them
+_STEINER = 0.15  # of what moving an inertia adds: what a number may differ from it by
+_TRIED = 3  # links that are fitted in a round
+_MOST = 80  # iterations: links that are far off take many
+
+Seek = Callable[..., Search]
+
+
+def searched_with_bodies(
+    seek: Seek,
+    here: Setting,
+    found: Search,
+    progress: Callable[[str, float], None] = lambda phase, share: None,
+    *,
+    forbid: Sequence[str] = (),
+) -> Search:
+    """What a search has found; where it leaves a rest, the search with the inertia of links fitted if that is better.
+
+    `link_inertia` is named at every link that recordings left out bear out, before all other causes.
+    """
+    if not _is_asked(here, found, forbid):
+        return found
+    progress("asking whether links are as heavy as the file says", 0.9)
+    before = found.setting or here
+    sound = replace(before, loop=found.structure.loop)
+    whole = with_bodies(sound, range(len(sound.loop.robot.joints)))
+    links, model = _links(thinned(whole), found)
+    if not links:
+        return found
+    some = _freed(sound, whole, found, links, model)
+    other = seek(some, progress, forbid=forbid)
+    if not np.isfinite(other.last.cost) or len(other.structure.table) != len(some.known.table):
+        return found
+    return _better(before.loop, whole, found, some, other, links)
+
+
+def _is_asked(here: Setting, found: Search, forbid: Sequence[str]) -> bool:
+    """Whether a rest is left in a robot whose links may be the reason."""
+    loop = found.structure.loop
+    rest = found.verdict in ("unknown", "named+rest") and np.isfinite(found.last.cost)
+    plain = loop.carried is None and all(joint.kind in ("revolute", "prismatic") for joint in loop.robot.joints)
+    rigid = len(found.structure.table) == len(here.known.table)
+    return rest and plain and rigid and EFFECT not in forbid
+
+
+def with_bodies(here: Setting, links: Sequence[int]) -> Setting:
+    """The setting with the ten numbers of links at the end of its table, which nothing frees yet."""
+    forces = largest_forces(here.loop, here.runs)
+    table = catalogue(here.loop, forces, gains_known=False, bodies=links).table
+    return replace(here, known=Catalogue(table, here.known.candidates))
+
+
+class Link(NamedTuple):
+    """A link, and the entries of the table that are those of its numbers that the recordings tell."""
+
+    at: int
+    entries: tuple[int, ...]
+    promise: float  # squares that a linear step of these would take away
+
+
+def _entries(here: Setting, link: int) -> list[int]:
+    """Where the ten numbers of a link stand in the table."""
+    return [k for k, e in enumerate(here.known.table) if e.name in TEN and e.at == (link,)]
+
+
+def _scale(loop: Loop) -> np.ndarray:
+    """Sizes of the ten numbers of each link (links, 10): kg, kg m, kg m2."""
+    return 1 / np.sqrt(rigid_prior(loop.robot, 1.0)[1]).reshape(-1, 10)
+
+
+class _Look:
+    """One linearisation of a model by all numbers of all links, and which of these the recordings tell."""
+
+    def __init__(self, here: Setting, now: Model, free: Sequence[int]):
+        self.here, self.scale, self.places = here, _scale(here.loop), range(len(here.loop.robot.joints))
+        self.level = _level(now)
+        self.columns = free_entries(free, [k for i in self.places for k in _entries(here, i)])
+        low, high = here.bounds.T
+        self.bound = [k for k in free if not low[k] < now.fit.theta[k] < high[k]]
+        self.others = [self.columns.index(k) for k in free if k not in self.bound]
+        one = fit(*now.structure, now.fit.theta[None], [self.columns], now.fit.start[None], width=len(self.columns),
+                  lanes=1, iterations=0)[0]  # fmt: skip
+        self.finite = bool(np.isfinite(one.cost))
+        if self.finite:
+            self.matrix, self.right = System(one.sums, now.structure.data, one.start).reduced(1e-6)
+
+    def told(self, links: Sequence[int]) -> list[Link]:
+        """Of each link the numbers that are told to a share of its size, beside all else and the links before it.
+
+        The noise is taken as large as all that is left. Masses come last: where a link turns about what moves, its mass
+        is as good as a moment of what carries it. What is not told stays as the file has it.
+        """
+        found, others = {i: Link(i, (), 0.0) for i in links}, list(self.others)
+        if not self.finite:
+            return list(found.values())
+        for numbers in (range(1, 10), (0,)):
+            for i in links:
+                entries = [_entries(self.here, i)[k] for k in numbers]
+                own = [self.columns.index(k) for k in entries]
+                information, score = _beside(self.matrix, self.right, own, others)
+                kept = _kept(information, self.scale[i][list(numbers)], self.level)
+                step = np.linalg.solve(information[np.ix_(kept, kept)], score[kept])
+                one = found[i]
+                new = (*one.entries, *(entries[k] for k in kept))
+                found[i] = Link(i, new, one.promise + float(score[kept] @ step))
+                others += [own[k] for k in kept]
+        return list(found.values())
+
+    def spare(self, links: Sequence[Link]) -> set[int]:
+        """Free numbers on their bounds whose part these links' numbers take: a rotor of none that turns with a link."""
+        if not self.finite:
+            return set()
+        others = [*self.others, *(self.columns.index(k) for link in links for k in link.entries)]
+        at = [(k, self.columns.index(k)) for k in self.bound]
+        left = [(k, _beside(self.matrix, self.right, [c], others)[0][0, 0] / self.matrix[c, c]) for k, c in at
+                if self.matrix[c, c] > 0]  # fmt: skip
+        return {k for k, share in left if share < _NO_OTHER}
+
+
+def _beside(
+    matrix: np.ndarray, right: np.ndarray, own: Sequence[int], others: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Information and score of some columns, the others being solved for."""
+    others = [k for k in others if matrix[k, k] > 0]
+    size = np.sqrt(np.diag(matrix)[others])
+    inner = matrix[np.ix_(others, others)] / np.outer(size, size) + 1e-12 * np.eye(len(others))
+    both = np.column_stack([matrix[np.ix_(others, own)], right[others]]) / size[:, None]
+    solved = np.linalg.lstsq(inner, both, rcond=1e-12)[0]
+    cross = matrix[np.ix_(others, own)] / size[:, None]
+    return matrix[np.ix_(own, own)] - cross.T @ solved[:, :-1], right[own] - cross.T @ solved[:, -1]
+
+
+def _kept(information: np.ndarray, scale: np.ndarray, level: float) -> list[int]:
+    """Numbers that are told to a share of their size: the worst told are left out one after another, masses first."""
+    sized = information * np.outer(scale, scale)
+    kept = [k for k in range(len(scale)) if sized[k, k] > 0]
+    while kept:
+        own = sized[np.ix_(kept, kept)]
+        spread = np.sqrt(level * np.diag(np.linalg.inv(own + 1e-12 * np.trace(own) * np.eye(len(kept)))))
+        if spread.max() <= TOLD_OF_A_LINK:
+            break
+        worst = max(range(len(kept)), key=lambda k: (min(spread[k], 1e3 * TOLD_OF_A_LINK), -kept[k]))
+        del kept[worst]
+    return kept
+
+
+def _links(here: Setting, found: Search) -> tuple[list[Link], Standing]:
+    """The links whose inertia recordings left out bear out, and the model with them.
+
+    Links come in one after another while each takes much of what is left, those that the others can spare go again: no
+    link by itself may predict better where several are wrong.
+    """
+    loop, table = found.structure.loop, here.known.table
+    theta = np.concatenate([found.last.theta, np.zeros(len(table) - len(found.last.theta))])
+    free = [int(k) for k in found.last.free if k >= 0]
+    structure = Structure(loop, table, here.cut(loop))
+    now = standing(here, structure, _fitted(here, structure, theta, free), free)
+    links, model = list[Link](), now.model
+    while len(links) < len(loop.robot.joints):
+        best = _one_more(here, now, model, links)
+        if best is None:
+            break
+        links, model = best
+        if model.excess < 1.0:
+            break
+    if not links:
+        return [], now
+    links, model = _told_further(here, now, model, links)
+    new = _stands_as_bodies(here, now, model, links)
+    if new is None or not borne_out(here, now, new, MOST_OF_A_REST)[2]:
+        return [], now
+    while len(links) > 1:
+        fewer, gone = [[x for x in links if x is not link] for link in links], set(free) - set(new.model.free)
+        least, other = min(
+            ((one, _with(here, now, new.model, one, gone)) for one in fewer), key=lambda one: one[1].fit.squares
+        )
+        without = _stands_as_bodies(here, now, other, least)
+        if without is None or borne_out(here, without, new)[2]:
+            break
+        links, new = least, without
+    return links, new
+
+
+def _one_more(here: Setting, now: Standing, model: Model, links: Sequence[Link]) -> tuple[list[Link], Model] | None:
+    """The links with the one more that leaves the least, where it takes much of what is left or leaves noise alone."""
+    look, taken = _Look(here, model, now.model.free), [link.at for link in links]
+    sets = [look.told([*taken, i]) for i in look.places if i not in taken]
+    sets = sorted([one for one in sets if one[-1].entries], key=lambda one: -one[-1].promise)[:_TRIED]
+    ends = [(one, _with(here, now, model, one, look.spare(one))) for one in sets]
+    best = min(ends, key=lambda one: one[1].fit.squares, default=None)
+    if best is None:
+        return None
+    links, new = best
+    return best if new.excess < 1.0 or new.fit.squares < (1 - GAIN_BESIDE_REST) * model.fit.squares else None
+
+
+def _told_further(here: Setting, now: Standing, model: Model, links: list[Link]) -> tuple[list[Link], Model]:
+    """The links with all numbers that are told now: the less is left, the more is told."""
+    for _ in range(_LOOKS):
+        look = _Look(here, model, now.model.free)
+        again = look.told([link.at for link in links])
+        if {k for x in again for k in x.entries} <= {k for x in links for k in x.entries}:
+            break
+        new = _with(here, now, model, again, look.spare(again))
+        if not new.fit.squares < model.fit.squares:
+            break
+        links, model = again, new
+    return links, model
+
+
+def _with(here: Setting, now: Standing, begin: Model, links: Sequence[Link], spare: Collection[int]) -> Model:
+    """The model with the numbers of some links fitted, from where a fit has ended; numbers that are `spare` stay."""
+    kept, theta = [k for k in now.model.free if k not in spare], begin.fit.theta.copy()
+    free = free_entries(kept, [k for link in links for k in link.entries])
+    away = [k for k, e in enumerate(here.known.table) if e.name in TEN and k not in free]
+    theta[away] = 0.0
+    new = _fitted(here, begin.structure, theta, free, begin.fit.start)
+    excess = float(excess_of(here, begin.structure, new).max()) if np.isfinite(new.cost) else np.inf
+    return Model(begin.structure, new, tuple(free), excess)
+
+
+def _stands_as_bodies(here: Setting, now: Standing, model: Model, links: Sequence[Link]) -> Standing | None:
+    """The model with links that bodies can have, and what it predicts of rows that it has not seen."""
+    near = as_bodies(here, model, links, now.squares.sum())
+    return None if near is None else standing(here, near.structure, near.fit, near.free)
+
+
+def borne_out(
+    here: Setting, now: Standing, new: Standing, least: float = GAIN_BESIDE_REST
+) -> tuple[float, float, bool]:
+    """Gain and t on rows that were not fitted, of all joints, and whether they are enough: `least` beside a rest."""
+    before, after = now.held.sum(-1), new.held.sum(-1)
+    gain = min(1 - after.sum() / max(before.sum(), 1e-300), 1 - new.squares.sum() / max(now.squares.sum(), 1e-300))
+    rest, each = new.excess.max() >= 1.0, by_recording(here)
+    runs = np.array([x.run for x in here.stretches])
+    t = t_of_recordings(before, after, runs) if each and rest else t_of(before, after)
+    enough = gain > least and t > T_BESIDE_REST and each if rest else gain > GAIN and t > T_WITHOUT_REST
+    return float(gain), float(t), bool(enough)
+
+
+def _fitted(here: Setting, structure: Structure, theta: np.ndarray, free: Sequence[int], start=None) -> Fit:
+    return fit(*structure, theta[None], [free], None if start is None else start[None],
+               width=max(here.width, len(free)), lanes=1, iterations=_MOST)[0]  # fmt: skip
+
+
+def as_bodies(here: Setting, model: Model, links: Sequence[Link], gained_from: float) -> Model | None:
+    """The model with links that bodies can have, or None where these predict clearly less than what was fitted."""
+    near = nearest_bodies(here, model, links)
+    least = model.fit.squares + BODY * (gained_from - model.fit.squares)
+    return near if near is not None and near.fit.squares <= least else None
+
+
+def nearest_bodies(here: Setting, model: Model, links: Sequence[Link]) -> Model | None:
+    """The model with the nearest links that bodies can have, all else fitted again; None where none is found.
+
+    Nearest by what the recordings tell. What they do not tell of a link is free to follow: a mass that stands as the
+    file has it may be too small for an inertia that was found.
+    """
+    structure, last, loop = model.structure, model.fit, model.structure.loop
+    if not np.isfinite(last.cost):
+        return None
+    names, ten = loop.robot.link_names, np.asarray(put(loop, structure.table, last.theta).robot.inertia)
+    places = [link.at for link in links]
+    if not inconsistencies(ten[places], [names[i] for i in places]):
+        return model
+    columns, entries = [int(k) for k in last.free if k >= 0], [k for link in links for k in link.entries]
+    own, others = ([columns.index(k) for k in ks] for ks in (entries, [k for k in columns if k not in entries]))
+    information, _ = _beside(*System(last.sums, structure.data, last.start).reduced(1e-6), own, others)
+    at = [10 * places.index(structure.table[k].at[0]) + TEN.index(structure.table[k].name) for k in entries]
+    away = _moved_to_bodies(loop, places, ten[places], at, information, _level(model))
+    if away is None:
+        return None
+    theta = last.theta.copy()
+    for i, more in zip(places, away, strict=True):
+        theta[_entries(here, i)] += more
+    one = _fitted(here, structure, theta, [k for k in model.free if k not in entries], last.start)
+    again = fit(*structure, one.theta[None], [model.free], one.start[None], width=max(here.width, len(model.free)),
+                lanes=1, iterations=0)[0]  # fmt: skip
+    return model._replace(fit=again) if np.isfinite(again.cost) else None
+
+
+def _moved_to_bodies(
+    loop: Loop, places: Sequence[int], ten: np.ndarray, told: Sequence[int], information: np.ndarray, level: float
+) -> np.ndarray | None:
+    """What makes bodies of links (links, 10): the numbers that are `told` stay if they can, else move by least."""
+    scale, every = _scale(loop)[places].ravel(), bodies(loop.robot)
+    mine = [replace(every[i], columns=tuple(range(10 * k, 10 * k + 10))) for k, i in enumerate(places)]
+    own = np.diag(np.sqrt(level) / scale)
+    factor = np.column_stack([own, own @ ten.ravel()])
+    with suppress(InputError):
+        kept = np.eye(len(own))[list(told)]
+        found = constrained(factor, Constraints(mine, equal=(kept, ten.ravel()[list(told)])), scale)
+        found[list(told)] = ten.ravel()[list(told)]
+        if not inconsistencies(found.reshape(-1, 10), [body.name for body in mine]):
+            return found.reshape(-1, 10) - ten
+    values, vectors = np.linalg.eigh(information)
+    seen = np.zeros((len(told), len(own)))
+    seen[:, list(told)] = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    own[list(told)] = 0.0
+    try:
+        return project(ten, mine, np.concatenate([own, seen])) - ten
+    except NotConverged:
+        return None
+
+
+def _level(model: Model) -> float:
+    """Squares of a row that counts, at least those of noise."""
+    return max(model.fit.squares / max((np.asarray(model.structure.data.weight) > 0).sum(), 1), 1.0)
+
+
+def _freed(sound: Setting, whole: Setting, found: Search, links: Sequence[Link], now: Standing) -> Setting:
+    """The setting whose file has the links that were found, and whose baseline fits their numbers further."""
+    of = [k for k, e in enumerate(whole.known.table) if e.name in TEN]
+    filed = put(sound.loop, tuple(whole.known.table[k] for k in of), now.model.fit.theta[of])
+    loop = eqx.tree_at(lambda m: m.robot.inertia, sound.loop, np.asarray(filed.robot.inertia))
+    entries, spare = [k for link in links for k in link.entries], set(found.last.free.tolist()) - set(now.model.free)
+    kept = [k for k in sound.baseline if k not in spare]
+    return replace(whole, loop=loop, baseline=(*kept, *entries), width=sound.width + len(entries))
+
+
+def _better(filed: Loop, whole: Setting, found: Search, some: Setting, other: Search, links: Sequence[Link]) -> Search:
+    """The search with links of their own inertia where rows that were not fitted bear it out, else that before."""
+    sound = other.setting or some
+    if other.verdict == "unknown":
+        baseline_alone(sound, other)
+    free = tuple(int(k) for k in other.last.free if k >= 0)
+    last = as_bodies(sound, Model(other.structure, other.last, free, 0.0), links, found.last.squares)
+    if last is None:
+        return found
+    other.last = last.fit
+    part = thinned(sound)
+    before, after = (_stands(part, x.structure, x.last) for x in (found, other))
+    gain, t, enough = borne_out(part, before, after, MOST_OF_A_REST)
+    if not enough:
+        return found
+    structure, last = _as_filed(whole, some, other)
+    numbers = {number: name for name, number in ROLLOUTS[EFFECT].in_rollouts.numbers}
+    sizes, named = [rms_of(part, x.held) for x in (before, after)], list[Named]()
+    for link in links:
+        at, reported = (
+            (whole.loop.robot.link_names[link.at],),
+            [numbers[whole.known.table[k].name] for k in link.entries],
+        )
+        one = Candidate(EFFECT, at, link.entries, (), tuple(reported))
+        by, share = most_unsteady(sound, structure, last, one)
+        if after.excess.max() >= 1.0 and share > STEADY_OF_A_LINK:
+            why = f"its size differs by {by} ({share:.2g} of what it explains), as that of what stands in for another"
+            return replace(found, doubtful=[*found.doubtful, (Name(EFFECT, at), gain, why)])
+        named.append(Named(one, t, gain, (), *sizes))
+    label = ", ".join(str(Name(n.candidate.effect, n.candidate.at)) for n in named)
+    first = found.first.theta
+    return replace(
+        other,
+        verdict="named+rest" if after.excess.max() >= 1.0 else "named",
+        named=[*named, *other.named],
+        structure=structure,
+        last=last,
+        creeps=found.creeps,
+        first=found.first._replace(theta=np.concatenate([first, np.zeros(len(structure.table) - len(first))])),
+        origin=found.origin,
+        p_value=found.p_value,
+        table=[*found.table[:1], (label, other.table[0][1]), *other.table[1:]],
+        held=[found.held[0], *other.held],
+        setting=replace(sound, loop=filed),
+    )
+
+
+def _stands(here: Setting, structure: Structure, last: Fit) -> Standing:
+    """A fit on the rows of `here`, and what it predicts of those that it has not seen."""
+    structure = structure._replace(data=here.cut(structure.loop))
+    free = [int(k) for k in last.free if k >= 0]
+    start = last.start if last.start.shape[1] == np.asarray(structure.data.start).shape[1] else None
+    return standing(here, structure, _fitted(here, structure, last.theta, free, start), free)
+
+
+def _as_filed(whole: Setting, some: Setting, other: Search) -> tuple[Structure, Fit]:
+    """The model with the numbers of the links as what is added to the file's, not to what was found in between."""
+    more = np.asarray(some.loop.robot.inertia) - np.asarray(whole.loop.robot.inertia)
+    theta, table = other.last.theta.copy(), other.structure.table
+    for k, entry in enumerate(table):
+        if entry.name in TEN:
+            theta[k] += more[entry.at[0], TEN.index(entry.name)]
+    loop = eqx.tree_at(lambda m: m.robot.inertia, other.structure.loop, np.asarray(whole.loop.robot.inertia))
+    return other.structure._replace(loop=loop), other.last._replace(theta=theta)
+
+
+def body_notes(here: Setting, found: Search) -> dict[Name, str]:
+    """By link that is named what its numbers look like, and what else of it was moved."""
+    notes = dict[Name, str]()
+    for one in [n.candidate for n in found.named if n.candidate.effect == EFFECT]:
+        i = here.loop.robot.link_names.index(one.at[0])
+        told = [_about_joint(here.loop, found, one, i)]
+        if any(found.last.theta[k] for k in _entries(here, i) if k not in one.entries):
+            told.append(
+                "numbers that the recordings do not tell were moved as little as it takes for a body to have the rest"
+            )
+        text = "; ".join(x for x in told if x)
+        if text:
+            notes[Name(one.effect, one.at)] = text
+    return notes
+
+
+def _about_joint(loop: Loop, found: Search, one: Candidate, i: int) -> str:
+    """Whether a link has too much of just what moving its inertia from its centre of mass to its joint adds.
+
+    Steiner's theorem: m (|c|^2 E - c c'). A file that states the inertia about the joint has it twice.
+    """
+    ten, theta = np.asarray(loop.robot.inertia)[i], found.last.theta
+    moved = from_com(ten[0], ten[1:4] / max(ten[0], 1e-12), np.zeros((3, 3)))
+    numbers = [k for k in one.entries if found.structure.table[k].name.startswith("inertia_")]
+    expected = np.array([-moved[TEN.index(found.structure.table[k].name)] for k in numbers])
+    if not len(numbers) or not np.abs(expected).max() > _STEINER * np.abs(moved[4:]).max():
+        return ""
+    if np.abs(theta[numbers] - expected).max() > _STEINER * np.abs(expected).max():
+        return ""
+    return (
+        "the file has too much of just what moving the inertia from the centre of mass to the joint adds (m c2): it may"
+        " state it about the joint, where it is to stand about the centre of mass"
+    )
+
+
+def identified(here: Setting, first: Fit) -> tuple[Setting, Fit, tuple[str, ...]]:
+    """The baseline's fit with those numbers of its links that the recordings tell, as bodies can have them.
+
+    With what is said of links that the recordings would have otherwise. A baseline without links stays as it is.
+    """
+    links = sorted({e.at[0] for k, e in enumerate(here.known.table) if k in here.baseline and e.name in TEN})
+    if not links:
+        return here, first, ()
+    structure = Structure(here.loop, here.known.table, here.data)
+    bare = [k for k in here.baseline if here.known.table[k].name not in TEN]
+    theta, model = values(*structure[:2]), Model(structure, first, (), 0.0)
+    model = model._replace(fit=_fitted(here, structure, theta, bare, first.start), free=tuple(bare))
+    told = list[Link]()
+    for _ in range(_LOOKS):  # the less is left, the more is told
+        now = _Look(here, model, bare).told(links)
+        if [x.entries for x in now] == [x.entries for x in told]:
+            break
+        told, free = now, free_entries(bare, [k for x in now for k in x.entries])
+        theta = model.fit.theta.copy()
+        theta[[k for i in links for k in _entries(here, i) if k not in free]] = 0.0
+        model = Model(structure, _fitted(here, structure, theta, free, model.fit.start), tuple(free), 0.0)
+        if not np.isfinite(model.fit.cost):
+            return here, first, ()
+    near = nearest_bodies(here, model, told)
+    notes = list[str]()
+    names = [here.loop.robot.link_names[i] for i in links]
+    if near is not None and near.fit.squares > model.fit.squares + BODY * (first.squares - model.fit.squares):
+        notes.append(
+            f"the recordings would have {', '.join(names)} with inertias that no body has; the nearest that one can"
+            f" have leave {near.fit.squares / max(model.fit.squares, 1e-300):.3g} times the squares: something else is"
+            " missing"
+        )
+    model = model if near is None else near
+    return replace(here, baseline=model.free), model.fit, tuple(notes)

@@ -1,0 +1,202 @@
+"""Links that a robot's file has wrong, asked where a rest is left; robots made by MuJoCo C."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from generators import servo_arm6
+from schema import matches
+
+import figaroh_jax as fj
+from figaroh_jax.cli import main
+from figaroh_jax.estimation.consistency import inconsistencies
+from figaroh_jax.rollouts.arm import search_arm
+from figaroh_jax.rollouts.bodies import Link, body_notes, nearest_bodies, searched_with_bodies, with_bodies
+from figaroh_jax.rollouts.causes import elastic_loop, elastic_table
+from figaroh_jax.rollouts.data import Run, Stretch
+from figaroh_jax.rollouts.fit import fit
+from figaroh_jax.rollouts.parameters import Entry, put, values
+from figaroh_jax.rollouts.reading import load_loop
+from figaroh_jax.rollouts.search import Model, Search
+from figaroh_jax.rollouts.setting import Setting, Structure, setting
+
+DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).parents[2] / "shared" / "data"))
+DT, EVERY, SECONDS, NOISE = 0.001, 5, 6.0, 5e-4
+MASS, COM, INERTIA = (0.5, 0.6), (0.2, 0.25), (0.004, 0.006)  # kg, m below the joint, kg m2 about the centre of mass
+
+
+def pendulum(inertia=INERTIA, com=COM, friction: float = 0.05) -> str:
+    """Two links in a plane that torques swing."""
+    first, second = (
+        f'<inertial pos="0 0 {-com[k]}" mass="{MASS[k]}" diaginertia="{inertia[k]} {inertia[k]} 0.002"/>'
+        for k in (0, 1)
+    )
+    held = f'solreffriction="{2 * DT} 1" solimpfriction="0.9999 0.9999"'
+    joint = f'axis="1 0 0" damping="0.01" frictionloss="{friction}" {held}'
+    return f"""<mujoco><option timestep="{DT}" integrator="implicitfast"><flag contact="disable"/></option><worldbody>
+    <body name="upper"><joint name="shoulder" {joint}/>{first}
+    <body name="lower" pos="0 0 -0.3"><joint name="elbow" {joint}/>{second}</body></body></worldbody>
+    <actuator><motor name="shoulder" joint="shoulder"/><motor name="elbow" joint="elbow"/></actuator></mujoco>"""
+
+
+def swung(text: str, number: int, seed: int = 3, detent: float = 0.0) -> Run:
+    """Torques of a few sines; `detent` N m of a torque of the angle that is no effect of the library's."""
+    model, rng = mujoco.MjModel.from_xml_string(text), np.random.default_rng([seed, number])
+    data, t = mujoco.MjData(model), np.arange(round(SECONDS / DT)) * DT
+    size, rate, late = (rng.uniform(low, high, (3, 2)) for low, high in ((0.3, 1.2), (0.3, 1.6), (0, 6)))
+    u = (size * np.array([1.0, 0.4]) * np.sin(2 * np.pi * rate * t[:, None, None] + late)).sum(1)
+    u = np.repeat(u[::EVERY], EVERY, 0)
+    q = np.zeros_like(u)
+    for k, one in enumerate(u):
+        q[k], data.ctrl[:] = data.qpos, one
+        data.qfrc_applied[:] = detent * np.sign(np.sin(20 * data.qpos))
+        mujoco.mj_step(model, data)
+    q = q[::EVERY] + rng.normal(0, NOISE, (len(q) // EVERY, 2))
+    return Run(f"run {number}", np.arange(len(q)) * DT * EVERY, u[::EVERY], q, None)
+
+
+def diagnosed(folder: Path, runs: list[Run], filed: str) -> tuple[Setting, Search]:
+    (folder / "robot.xml").write_text(filed)
+    cut = [Stretch(k, first, 100) for k in range(len(runs)) for first in range(0, len(runs[0].time) - 99, 100)]
+    here = setting(load_loop(folder / "robot.xml")[0], runs, stretches=cut)
+    return here, searched_with_bodies(search_arm, here, search_arm(here))
+
+
+def sizes(found: Search) -> dict[tuple[str, ...], dict[str, float]]:
+    return {
+        (n.candidate.effect, *n.candidate.at): dict(
+            zip(n.candidate.reported, found.last.theta[list(n.candidate.entries)], strict=True)
+        )
+        for n in found.named
+    }
+
+
+def about_joint(k: int) -> float:
+    """What moving a link's inertia from its centre of mass to its joint adds."""
+    return MASS[k] * COM[k] ** 2
+
+
+def test_an_inertia_that_a_file_states_about_the_joint_is_found_and_told(tmp_path: Path):
+    twice = tuple(INERTIA[k] + about_joint(k) for k in (0, 1))
+    runs = [swung(pendulum(), k) for k in range(4)]
+    here, found = diagnosed(tmp_path, runs, pendulum(twice))
+    assert found.verdict == "named"
+    told = sizes(found)
+    assert set(told) == {("link_inertia", "upper"), ("link_inertia", "lower")}
+    for k, link in enumerate(("upper", "lower")):
+        np.testing.assert_allclose(told["link_inertia", link]["ixx"], -about_joint(k), atol=0.02 * about_joint(k))
+    notes = body_notes(found.setting or here, found)
+    assert len(notes) == 2
+    assert all("about the joint" in text for text in notes.values())
+    ten = np.asarray(put(found.structure.loop, found.structure.table, found.last.theta).robot.inertia)
+    assert not inconsistencies(ten, ["upper", "lower"])
+    (tmp_path / "right").mkdir()
+    _, clean = diagnosed(tmp_path / "right", runs, pendulum())
+    assert clean.verdict == "nothing"
+
+
+def test_a_link_that_is_drawn_is_found_and_a_detent_is_none(tmp_path: Path):
+    rng = np.random.default_rng()
+    seed, link = int(rng.integers(1 << 30)), int(rng.integers(2))
+    wrong = list(COM)
+    wrong[link] *= float(rng.choice([0.7, 1.35]))
+    told = f"seed {seed}, {('upper', 'lower')[link]} at {wrong[link]:.3g} m"
+    _, found = diagnosed(tmp_path, [swung(pendulum(), k, seed) for k in range(4)], pendulum(com=tuple(wrong)))
+    assert found.verdict == "named", told
+    assert {n.candidate.effect for n in found.named} == {"link_inertia"}, told
+    size = sizes(found)["link_inertia", ("upper", "lower")[link]]["mz"]
+    assert abs(size + MASS[link] * (COM[link] - wrong[link])) < 0.1 * MASS[link] * COM[link], told
+    (tmp_path / "detent").mkdir()
+    _, other = diagnosed(tmp_path / "detent", [swung(pendulum(), k, seed, 0.15) for k in range(4)], pendulum())
+    assert "link_inertia" not in {n.candidate.effect for n in other.named}, told
+
+
+def test_numbers_of_links_stay_with_them_beside_a_spring(tmp_path: Path):
+    """MuJoCo's arm with a hinge that is all but stiff is the arm without: so is ours, whatever its links carry."""
+    (tmp_path / "arm.xml").write_text(servo_arm6.model_text())
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    table, sizes = (Entry("payload", (3,)), Entry("mass_x", (1,))), np.array([0.2, 0.05])
+    u = servo_arm6.command(3, 0)[:600]
+    rigid, bare = (np.asarray(fj.rollout(x, u, u[0]).reading) for x in (put(loop, table, sizes), loop))
+    for joint in (0, 1):
+        soft, more = elastic_loop(loop, joint, 3e4, 10.0), elastic_table(loop, table, joint)
+        new = put(soft, more, np.append(sizes, [3e4, 10.0, 0.0]))
+        read = np.asarray(fj.rollout(new, u, np.append(u[0], 0.0)).reading)[:, :6]
+        assert np.abs(read - rigid).max() < 0.05 * np.abs(rigid - bare).max()
+
+
+@pytest.mark.parametrize("told", [("mass_z", "inertia_xx"), ("mass", "mass_z", "inertia_xx")])
+def test_a_link_that_no_body_can_have_becomes_one(tmp_path: Path, told: tuple[str, ...]):
+    """What the recordings tell stays where a body can have it; where its mass is told as well, no body can."""
+    (tmp_path / "robot.xml").write_text(pendulum())
+    runs = [swung(pendulum(), k) for k in range(3)]
+    here = with_bodies(setting(load_loop(tmp_path / "robot.xml")[0], runs), (0, 1))
+    entries = [k for k, e in enumerate(here.known.table) if e.name in told and e.at == (1,)]
+    inertia = next(k for k in entries if here.known.table[k].name == "inertia_xx")
+    free = [*here.baseline, *entries]
+    structure, theta = Structure(here.loop, here.known.table, here.data), values(here.loop, here.known.table)
+    theta[inertia] = -0.008  # .0355 kg m2 about the joint, where a point mass has .0375
+    one = fit(*structure, theta[None], [free], width=len(free), lanes=1, iterations=0)[0]
+    links = ["upper", "lower"]
+    assert inconsistencies(np.asarray(put(*structure[:2], theta).robot.inertia), links)
+    near = nearest_bodies(here, Model(structure, one, tuple(free), 0.0), [Link(1, tuple(entries), 0.0)])
+    assert near is not None
+    assert not inconsistencies(np.asarray(put(*structure[:2], near.fit.theta).robot.inertia), links)
+    assert (near.fit.theta[inertia] == theta[inertia]) == ("mass" not in told)
+
+
+def test_identify_tells_the_links_that_a_task_names(tmp_path: Path):
+    """The numbers cover the truth, and the links are those of bodies."""
+    wrong = (INERTIA[0], INERTIA[1] + 0.02), (COM[0], 0.9 * COM[1])
+    (tmp_path / "robot.xml").write_text(pendulum(*wrong))
+    data = []
+    for k in range(4):
+        run = swung(pendulum(), k)
+        np.savez(tmp_path / f"{k}.npz", t=run.time, u=run.command, q=run.position)
+        role = "holdout" if k == 3 else "fit"
+        data.append({"file": f"{k}.npz", "time": "t", "command": "u", "position": "q", "role": role})
+    task = {
+        "robot": {"model": "robot.xml"}, "data": data, "rollout": {"window": 0.5},
+        "baseline": {"effects": [{"effect": "link_inertia", "at": ["lower"]}]},
+    }  # fmt: skip
+    (tmp_path / "task.yaml").write_text(json.dumps(task))
+    assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    matches("identify", result)
+    told = {p["expression"]: p for p in result["base_parameters"]}
+    moment, inertia = MASS[1] * 0.1 * COM[1], INERTIA[1] - wrong[0][1] + MASS[1] * COM[1] ** 2 * (1 - 0.81)
+    for name, truth in (("mz lower", -moment), ("ixx lower", inertia)):
+        assert abs(told[name]["value"] - truth) < 4 * told[name]["std"] + 1e-5, name
+    (link,) = result["links"]
+    assert link["name"] == "lower"
+    assert link["consistent"]
+    np.testing.assert_allclose(result["fit"]["rms"], NOISE, atol=0.1 * NOISE)
+
+
+@pytest.mark.skipif(not (DATA / "dfki_double_pendulum").is_dir(), reason="FIGAROH_JAX_DATA is not there")
+def test_the_real_double_pendulum_has_its_inertia_about_its_joints(tmp_path: Path):
+    """The set's own identified parameters (I1, I2 about the joints) stand in its URDF as about the centres of mass."""
+    folder = DATA / "dfki_double_pendulum"
+    files = sorted(folder.glob("C1_*.npz"))[:6]
+    data = [
+        {"file": str(f), "time": "t", "command": "tau", "position": "q", "role": "holdout" if k == 5 else "fit"}
+        for k, f in enumerate(files)
+    ]
+    task = {
+        "robot": {"model": str(folder / "double_pendulum_C1.urdf")}, "data": data, "rollout": {"window": 0.3},
+        "actuator": {"Joint1": {"kind": "torque"}, "Joint2": {"kind": "torque"}},
+    }  # fmt: skip
+    (tmp_path / "task.yaml").write_text(json.dumps(task))
+    main(["diagnose", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "out"), "--quiet"])
+    answer = json.loads((tmp_path / "out" / "answer.json").read_text())
+    assert answer["verdict"] == "named+rest"
+    told = {tuple(c["at"]): c for c in answer["causes"] if c["effect"] == "link_inertia"}
+    assert set(told) == {("Link1",), ("Link2",)}
+    for link, extra in (("Link1", 0.52346 * 0.2**2), ("Link2", 0.62557 * 0.25569**2)):
+        assert abs(told[link,]["parameters"]["ixx"]["value"] + extra) < 0.1 * extra
+    assert sum("about the joint" in note for note in answer["notes"]) == 2
