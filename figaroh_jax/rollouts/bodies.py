@@ -26,10 +26,11 @@ from .arm import baseline_alone
 from .causes import Candidate, Catalogue, catalogue
 from .fit import Fit, System, fit
 from .gates import rms_of, standing
-from .loop import Loop
+from .loop import Loop, brought_back
 from .parameters import TEN, put, values
 from .screening import Standing, excess_of
 from .search import Model, Named, Search, t_of, t_of_recordings
+from .sensitivity import Windows
 from .setting import Setting, Structure, by_recording, free_entries, largest_forces, thinned
 from .steady import most_unsteady
 from .thresholds import (
@@ -43,12 +44,13 @@ from .thresholds import (
     TOLD_OF_A_LINK,
 )
 
-__all__ = ["EFFECT", "body_notes", "identified", "searched_with_bodies"]
+__all__ = ["EFFECT", "body_notes", "consistent", "fitted_links", "searched_with_bodies", "told_alone"]
 
 EFFECT = "link_inertia"
 _LOOKS = 4  # at most, at which numbers are told
 _NO_OTHER = 1e-5  # of what a number does: what others cannot do as well, where it is one of them
 _STEINER = 0.15  # of what moving an inertia adds: what a number may differ from it by
+_EARLY = 0.25  # of a window's rows, that are fitted first
 _TRIED = 3  # links that are fitted in a round
 _MOST = 80  # iterations: links that are far off take many
 
@@ -71,12 +73,13 @@ def searched_with_bodies(
         return found
     progress("asking whether links are as heavy as the file says", 0.9)
     before = found.setting or here
-    sound = replace(before, loop=found.structure.loop)
+    plain = _rigid(here, found)
+    sound = replace(before, loop=plain.structure.loop)
     whole = with_bodies(sound, range(len(sound.loop.robot.joints)))
-    links, model = _links(thinned(whole), found)
+    links, model = _links(thinned(whole), plain)
     if not links:
         return found
-    some = _freed(sound, whole, found, links, model)
+    some = _freed(sound, whole, plain, links, model)
     other = seek(some, progress, forbid=forbid)
     if not np.isfinite(other.last.cost) or len(other.structure.table) != len(some.known.table):
         return found
@@ -88,8 +91,21 @@ def _is_asked(here: Setting, found: Search, forbid: Sequence[str]) -> bool:
     loop = found.structure.loop
     rest = found.verdict in ("unknown", "named+rest") and np.isfinite(found.last.cost)
     plain = loop.carried is None and all(joint.kind in ("revolute", "prismatic") for joint in loop.robot.joints)
-    rigid = len(found.structure.table) == len(here.known.table)
-    return rest and plain and rigid and EFFECT not in forbid
+    return rest and plain and EFFECT not in forbid
+
+
+class _Rigid(NamedTuple):
+    """A model without a spring."""
+
+    structure: Structure
+    last: Fit
+
+
+def _rigid(here: Setting, found: Search) -> _Rigid:
+    """The model that a search has ended with, or its baseline where that has a spring: it may stand in for a link."""
+    if len(found.structure.table) == len(here.known.table) or found.origin is None:
+        return _Rigid(found.structure, found.last)
+    return _Rigid(found.origin, found.first)
 
 
 def with_bodies(here: Setting, links: Sequence[int]) -> Setting:
@@ -193,7 +209,7 @@ def _kept(information: np.ndarray, scale: np.ndarray, level: float) -> list[int]
     return kept
 
 
-def _links(here: Setting, found: Search) -> tuple[list[Link], Standing]:
+def _links(here: Setting, found: _Rigid) -> tuple[list[Link], Standing]:
     """The links whose inertia recordings left out bear out, and the model with them.
 
     Links come in one after another while each takes much of what is left, those that the others can spare go again: no
@@ -283,13 +299,37 @@ def borne_out(
     rest, each = new.excess.max() >= 1.0, by_recording(here)
     runs = np.array([x.run for x in here.stretches])
     t = t_of_recordings(before, after, runs) if each and rest else t_of(before, after)
+    if not rest:  # all that is seen is explained, be it in a few places only
+        t = max(t, float(np.sqrt(max(before.sum() - after.sum(), 0.0))) / 2)
     enough = gain > least and t > T_BESIDE_REST and each if rest else gain > GAIN and t > T_WITHOUT_REST
     return float(gain), float(t), bool(enough)
 
 
-def _fitted(here: Setting, structure: Structure, theta: np.ndarray, free: Sequence[int], start=None) -> Fit:
-    return fit(*structure, theta[None], [free], None if start is None else start[None],
-               width=max(here.width, len(free)), lanes=1, iterations=_MOST)[0]  # fmt: skip
+def _fitted(
+    here: Setting, structure: Structure, theta: np.ndarray, free: Sequence[int], start: np.ndarray | None = None
+) -> Fit:
+    """The fit from the states `start`; of a robot that no drive brings back also by the first rows of each window
+    before all of them, and the better one: a link that is far off leads it far from what was measured."""
+
+    def fitted(data: Windows, theta: np.ndarray, start: np.ndarray | None, most: int) -> Fit:
+        return fit(*structure._replace(data=data), theta[None], [free], None if start is None else start[None],
+                   width=max(here.width, len(free)), lanes=1, iterations=most)[0]  # fmt: skip
+
+    plain = fitted(structure.data, theta, start, _MOST)
+    if brought_back(structure.loop).all():
+        return plain
+    early = fitted(_early(structure.data), theta, None, _MOST // 2)
+    if not np.isfinite(early.cost):
+        return plain
+    other = fitted(structure.data, early.theta, early.start, _MOST)
+    return plain if plain.cost <= other.cost or not np.isfinite(other.cost) else other
+
+
+def _early(data: Windows) -> Windows:
+    """The windows with the first of their rows alone."""
+    weight = np.array(data.weight)
+    weight[round(_EARLY * (weight > 0).any((1, 2)).sum()) :] = 0.0
+    return eqx.tree_at(lambda d: d.weight, data, weight)
 
 
 def as_bodies(here: Setting, model: Model, links: Sequence[Link], gained_from: float) -> Model | None:
@@ -357,7 +397,7 @@ def _level(model: Model) -> float:
     return max(model.fit.squares / max((np.asarray(model.structure.data.weight) > 0).sum(), 1), 1.0)
 
 
-def _freed(sound: Setting, whole: Setting, found: Search, links: Sequence[Link], now: Standing) -> Setting:
+def _freed(sound: Setting, whole: Setting, found: _Rigid, links: Sequence[Link], now: Standing) -> Setting:
     """The setting whose file has the links that were found, and whose baseline fits their numbers further."""
     of = [k for k, e in enumerate(whole.known.table) if e.name in TEN]
     filed = put(sound.loop, tuple(whole.known.table[k] for k in of), now.model.fit.theta[of])
@@ -468,37 +508,46 @@ def _about_joint(loop: Loop, found: Search, one: Candidate, i: int) -> str:
     )
 
 
-def identified(here: Setting, first: Fit) -> tuple[Setting, Fit, tuple[str, ...]]:
-    """The baseline's fit with those numbers of its links that the recordings tell, as bodies can have them.
+def fitted_links(here: Setting) -> list[Link]:
+    """The links that the baseline fits, with the numbers that it frees."""
+    free = [k for k in here.baseline if here.known.table[k].name in TEN]
+    places = sorted({here.known.table[k].at[0] for k in free})
+    return [Link(i, tuple(k for k in free if here.known.table[k].at == (i,)), 0.0) for i in places]
 
-    With what is said of links that the recordings would have otherwise. A baseline without links stays as it is.
-    """
-    links = sorted({e.at[0] for k, e in enumerate(here.known.table) if k in here.baseline and e.name in TEN})
+
+def told_alone(here: Setting, first: Fit) -> tuple[Setting, Fit]:
+    """The baseline's fit with those numbers of its links that the recordings tell; without links as it is."""
+    links = [link.at for link in fitted_links(here)]
     if not links:
-        return here, first, ()
+        return here, first
     structure = Structure(here.loop, here.known.table, here.data)
     bare = [k for k in here.baseline if here.known.table[k].name not in TEN]
-    theta, model = values(*structure[:2]), Model(structure, first, (), 0.0)
-    model = model._replace(fit=_fitted(here, structure, theta, bare, first.start), free=tuple(bare))
-    told = list[Link]()
+    begun = _fitted(here, structure, values(*structure[:2]), bare, first.start)
+    model, entries = Model(structure, begun, tuple(bare), 0.0), set[int]()
     for _ in range(_LOOKS):  # the less is left, the more is told
-        now = _Look(here, model, bare).told(links)
-        if [x.entries for x in now] == [x.entries for x in told]:
-            break
-        told, free = now, free_entries(bare, [k for x in now for k in x.entries])
-        theta = model.fit.theta.copy()
-        theta[[k for i in links for k in _entries(here, i) if k not in free]] = 0.0
-        model = Model(structure, _fitted(here, structure, theta, free, model.fit.start), tuple(free), 0.0)
         if not np.isfinite(model.fit.cost):
-            return here, first, ()
-    near = nearest_bodies(here, model, told)
-    notes = list[str]()
-    names = [here.loop.robot.link_names[i] for i in links]
-    if near is not None and near.fit.squares > model.fit.squares + BODY * (first.squares - model.fit.squares):
-        notes.append(
-            f"the recordings would have {', '.join(names)} with inertias that no body has; the nearest that one can"
-            f" have leave {near.fit.squares / max(model.fit.squares, 1e-300):.3g} times the squares: something else is"
-            " missing"
-        )
-    model = model if near is None else near
-    return replace(here, baseline=model.free), model.fit, tuple(notes)
+            return here, first
+        told = {k for link in _Look(here, model, bare).told(links) for k in link.entries}
+        if told == entries:
+            break
+        entries, free, theta = told, free_entries(bare, sorted(told)), model.fit.theta.copy()
+        theta[[k for i in links for k in _entries(here, i) if k not in told]] = 0.0
+        model = Model(structure, _fitted(here, structure, theta, free, model.fit.start), tuple(free), 0.0)
+    return replace(here, baseline=model.free), model.fit
+
+
+def consistent(here: Setting, first: Fit) -> tuple[Fit, tuple[str, ...]]:
+    """The baseline's fit with its links as bodies can have them, and what is said where the recordings would not."""
+    links = fitted_links(here)
+    structure = Structure(here.loop, here.known.table, here.data)
+    near = nearest_bodies(here, Model(structure, first, here.baseline, 0.0), links) if links else None
+    if near is None:
+        return first, ()
+    worse = (near.fit.squares - first.squares) / first.squares
+    if worse < BODY:
+        return near.fit, ()
+    names = ", ".join(here.loop.robot.link_names[link.at] for link in links)
+    return near.fit, (
+        f"the recordings would have {names} with inertias that no body has; the nearest that one can have leave"
+        f" {1 + worse:.3g} times the squares: something else is missing",
+    )

@@ -15,7 +15,7 @@ from ..effects.plausibility import implausible
 from ..errors import InputError
 from ..estimation.consistency import inconsistencies
 from ..results import Trace
-from .bodies import EFFECT, identified
+from .bodies import EFFECT, consistent, fitted_links, told_alone
 from .creep import fitted_with_both
 from .data import Run, Stretch, as_recorded, noise_of, windows
 from .fit import Fit, System, fit, standard_errors
@@ -75,9 +75,10 @@ def identify_rollout_task(
         first = begun(here)
         if not np.isfinite(first.cost):
             raise InputError(f"{task.robot.model}: {diverged(here, first)}")
-        here, first, links = identified(here, first)
+        here, first = told_alone(here, first)
         here, first, more = fitted_with_both(here, first)
         here, first = _by_colour(here, first)
+        first, links = consistent(here, first)
         final = put(here.loop, here.known.table, first.theta)
         held = {run.name: (run, simulated(final, run)) for run in runs if run.holdout}
         notes = (
@@ -162,11 +163,10 @@ def _result(
 def _links(here: Setting, first: Fit) -> list[dict[str, Any]]:
     """The ten parameters of the links that were fitted, in the frame of their joints (kg, kg m, kg m2)."""
     robot = put(here.loop, here.known.table, first.theta).robot
-    places = sorted({e.at[0] for k, e in enumerate(here.known.table) if k in here.baseline and e.name in TEN})
     ten, names = np.asarray(robot.inertia), robot.link_names
     return [
         {"name": names[i], "parameters": ten[i].tolist(), "consistent": not inconsistencies(ten[[i]], [names[i]])}
-        for i in places
+        for i in (link.at for link in fitted_links(here))
     ]
 
 

@@ -41,6 +41,7 @@ __all__ = [
     "Step",
     "advance",
     "alike",
+    "brought_back",
     "turns",
     "integrated",
     "observe",
@@ -209,6 +210,12 @@ class Loop(eqx.Module):
 def turns(loop: Loop) -> np.ndarray:
     """Whether each coordinate turns, (nv,)."""
     return loop.robot.dofs.turns[np.argsort(loop.robot.dofs.column)]
+
+
+def brought_back(loop: Loop) -> np.ndarray:
+    """Which joints a drive brings back to their command, (nv,): others leave any motion."""
+    back = (np.asarray(loop.drives.transmission) != 0) & (np.asarray(loop.drives.bias)[:, [1]] < 0)
+    return back.any(0)
 
 
 def alike(loop: Loop, *, slides: bool = False) -> np.ndarray:

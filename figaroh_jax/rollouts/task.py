@@ -27,7 +27,7 @@ from .causes import BASELINE
 from .creep import REMARK, creep_notes, searched_with_both
 from .data import Run, Stretch, ahead_of_command, as_recorded, noise_of, regular, windows, without_gaps
 from .fit import Fit
-from .loop import Loop, alike, turns
+from .loop import Loop, alike, brought_back, turns
 from .own import left_out
 from .parameters import put, unit_of, values
 from .reading import load_loop
@@ -184,8 +184,7 @@ def _cut(task: Task, loop: Loop, runs: Sequence[Run]) -> tuple[Stretch, ...]:
     wanted = task.rollout.window
     if wanted == "whole" or (wanted == "auto" and not separable(loop)):
         return ()
-    back = (np.asarray(loop.drives.transmission) != 0) & (np.asarray(loop.drives.bias)[:, [1]] < 0)
-    auto = _WINDOW if back.any(0).all() else _OPEN
+    auto = _WINDOW if brought_back(loop).all() else _OPEN
     length = auto if wanted == "auto" else float(wanted)
     found = []
     for k, run in enumerate(r for r in runs if not r.holdout):
