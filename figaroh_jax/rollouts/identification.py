@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..effects.catalogue import ROLLOUTS
@@ -17,14 +16,22 @@ from ..estimation.consistency import inconsistencies
 from ..results import Trace
 from .bodies import EFFECT, consistent, fitted_links, told_alone
 from .creep import fitted_with_both
-from .data import Run, Stretch, as_recorded, noise_of, windows
+from .data import Run, as_recorded
 from .fit import Fit, System, fit, standard_errors
 from .loop import Loop
 from .own import is_own
 from .parameters import BOUNDS, OF_DRIVES, TEN, put, unit_of
-from .sensitivity import predicted
 from .setting import Setting, Structure, begun, coloured, residuals
-from .task import all_slide, colour_notes, diagnosis_setting, diverged, extended_of, read_rollouts, simulated
+from .task import (
+    all_slide,
+    colour_notes,
+    diagnosis_setting,
+    diverged,
+    extended_of,
+    judged_rows,
+    read_rollouts,
+    simulated,
+)
 
 if TYPE_CHECKING:
     from ..effects.extended import ExtendedModel
@@ -80,7 +87,8 @@ def identify_rollout_task(
         here, first = _by_colour(here, first)
         first, links = consistent(here, first)
         final = put(here.loop, here.known.table, first.theta)
-        held = {run.name: (run, simulated(final, run)) for run in runs if run.holdout}
+        rows = judged_rows(here)
+        held = {run.name: (run, simulated(final, run, rows)) for run in runs if run.holdout}
         notes = (
             *notes,
             *links,
@@ -90,8 +98,9 @@ def identify_rollout_task(
         )
         result = _result(here, first, held, notes)
         progress("simulating the recordings", 0.9)
-        traces = _traces(loop, final, runs)
-    predictions = {name: as_recorded(run, read) for name, (run, read) in held.items()}
+        traces = _traces(loop, final, runs, rows)
+        whole = {name: simulated(final, run) if rows else read for name, (run, read) in held.items()}
+    predictions = {name: as_recorded(run, whole[name]) for name, (run, _) in held.items()}
     straight = {name for j in loop.robot.joints if j.kind == "prismatic" for name in (j.name,)}
     joints = tuple(loop.robot.dof_names[k] for k in loop.measured)
     units = tuple("m" if name in straight else "rad" for name in joints)
@@ -108,18 +117,12 @@ def _by_colour(here: Setting, first: Fit) -> tuple[Setting, Fit]:
     return (again, new) if np.isfinite(new.cost) else (here, first)
 
 
-def _traces(given: Loop, fitted: Loop, runs: Sequence[Run]) -> tuple[Trace, ...]:
-    """Every recording simulated as a whole, in one batch for each model; what diverges is no number."""
-    stretches = [Stretch(k, 0, len(run.time)) for k, run in enumerate(runs)]
-    noise = np.max([noise_of(run.position) for run in runs], axis=0)
-    data = windows(given, runs, stretches, [noise], 0.3, smooth=True)
-    read = []
-    for loop in (given, fitted):
-        found = np.asarray(predicted(loop, (), jnp.zeros((1, 0)), data, np.asarray(data.start)[None]))[0]
-        read.append(np.where(np.abs(found) < _FAR, found, np.nan))
+def _traces(given: Loop, fitted: Loop, runs: Sequence[Run], rows: int | None) -> tuple[Trace, ...]:
+    """Every recording simulated by both, as a whole or in windows of `rows`; what diverges is no number."""
     traces = []
-    for k, run in enumerate(runs):
-        before, after = (x[: len(run.time), : run.position.shape[1], k] for x in read)
+    for run in runs:
+        found = [simulated(loop, run, rows)[:, : run.position.shape[1]] for loop in (given, fitted)]
+        before, after = (np.where(np.abs(x) < _FAR, x, np.nan) for x in found)
         velocity = np.gradient(run.position, run.time, axis=0) if run.velocity is None else run.velocity
         role = "holdout" if run.holdout else "fit"
         traces.append(Trace(run.name, role, run.time, run.position, velocity, run.position, before, after))

@@ -50,6 +50,8 @@ __all__ = [
     "diagnosis_setting",
     "diverged",
     "extended_of",
+    "judged_note",
+    "judged_rows",
     "one_number_notes",
     "read_rollouts",
     "simulated",
@@ -208,7 +210,8 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
     last = (found.structure, found.last) if named else (first, found.first)
     final = put(last[0].loop, last[0].table, last[1].theta)
     start = put(here.loop, here.known.table, found.first.theta)
-    held = {run.name: (simulated(start, run), simulated(final, run)) for run in runs if run.holdout}
+    rows = judged_rows(here)
+    held = {run.name: (simulated(start, run, rows), simulated(final, run, rows)) for run in runs if run.holdout}
     gain = _gain(held, runs, found)
     model = extended_of(final if n == final.robot.nv else start)
     traces = _traces(here, runs, first, found, last, held)
@@ -235,6 +238,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
             *notes,
             *_kinds_note(loop, gain),
             *colour_notes(here),
+            *(judged_note(here) if held else ()),
             *(f"{name}: {text}" for name, text in told.items()),
             *(_open_sizes(found) if named else ()),
             *(one_number_notes(found) if named else ()),
@@ -247,7 +251,8 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
         prismatic=tuple(j.kind == "prismatic" for j in loop.robot.joints if not j.follows),
         of_positions=True,
     )
-    predictions = {run.name: as_recorded(run, held[run.name][1]) for run in runs if run.holdout}
+    whole = {run.name: simulated(final, run) if rows else held[run.name][1] for run in runs if run.holdout}
+    predictions = {run.name: as_recorded(run, whole[run.name]) for run in runs if run.holdout}
     return RolloutDiagnosis(diagnosis, final, predictions)
 
 
@@ -283,7 +288,9 @@ def _refitted_note(here: Setting, runs: Sequence[Run], refitted: Sequence[str], 
         return ()
     asked = [run for run in runs if run.holdout] or [run for run in runs if not run.holdout]
     with np.errstate(over="ignore", invalid="ignore"):
-        error = _pooled([run.position - simulated(here.loop, run) for run in asked], alike(here.loop))
+        error = _pooled(
+            [run.position - simulated(here.loop, run, judged_rows(here)) for run in asked], alike(here.loop)
+        )
     what = "recordings kept out" if asked[0].holdout else "the recordings"
     unit = "m" if all_slide(here.loop) else "rad"
     size = f"{1e3 * error:.3g} m{unit}" if error < 0.1 else f"{error:.3g} {unit}" if error < _FAR else "without bounds"
@@ -344,12 +351,38 @@ def diverged(here: Setting, first: Fit) -> str:
     )
 
 
-def simulated(loop: Loop, run: Run) -> np.ndarray:
-    """Readings of the encoders (rows, joints) that the loop predicts from a recording's first state and command."""
-    data = windows(loop, [run], [Stretch(0, 0, len(run.time))], [noise_of(run.position)], 0.3, smooth=True)
+def simulated(loop: Loop, run: Run, rows: int | None = None) -> np.ndarray:
+    """Readings of the encoders (rows, joints) that the loop predicts from a recording's first state and command.
+
+    With `rows` from the measured state at the beginning of each window of so many.
+    """
+    total = len(run.time)
+    many = total if rows is None else min(rows, total)
+    cut = [Stretch(0, first, min(many, total - first)) for first in range(0, total, many)]
+    data = windows(loop, [run], cut, [noise_of(run.position)], 0.3, smooth=True)
     with jax.enable_x64(True):
-        read = predicted(loop, (), jnp.zeros((1, 0)), data, np.asarray(data.start)[None])
-    return np.asarray(read)[0, : len(run.time), :, 0]
+        read = np.asarray(predicted(loop, (), jnp.zeros((1, 0)), data, np.asarray(data.start)[None]))[0]
+    return np.concatenate([read[: one.rows, :, k] for k, one in enumerate(cut)])
+
+
+def judged_rows(here: Setting) -> int | None:
+    """Rows of the windows in which held-out recordings are judged; None: as wholes.
+
+    What no drive brings back to its command leaves any motion, however right its model is.
+    """
+    return None if brought_back(here.loop).all() else max(one.rows for one in here.stretches)
+
+
+def judged_note(here: Setting) -> tuple[str, ...]:
+    """That held-out recordings are judged in windows."""
+    rows = judged_rows(here)
+    if rows is None:
+        return ()
+    length = rows * regular(here.runs[0].name, here.runs[0].time)
+    return (
+        f"recordings are judged in windows of {length:.3g} s, each simulated from the state measured at its beginning:"
+        " no drive brings every joint back to its command, so that a whole recording tells nothing",
+    )
 
 
 def _rms(structure: Structure, fitted: Any, scale: np.ndarray) -> np.ndarray:
