@@ -58,7 +58,8 @@ def test_the_page_of_effects_has_the_row_of_each_effect_of_rollouts(name: str) -
 def test_the_effects_of_rollouts_are_those_that_a_search_looks_for() -> None:
     """The search's candidates, the structures that it tries, and names of the contract that nothing is behind."""
     loop, _ = load_loop(DEMO, {"elbow": {"kind": "position", "kp": 20.0, "kd": 0.5}})
-    looked_for = {one.effect for one in catalogue(with_pairs(loop), np.ones(1), gains_known=False).candidates}
+    every = catalogue(with_pairs(loop), np.ones(1), gains_known=False, bodies=[0]).candidates
+    looked_for = {one.effect for one in every}
     assert {*ROLLOUT_EFFECTS} - {*NOT_LOOKED_FOR} == looked_for | {*BASELINE, "joint_elasticity", "backlash"}
     known = {*OWN, *KINEMATIC, *ROLLOUT_EFFECTS, "outlier"}
     assert known >= {*CONTRACT_EFFECTS}, {*CONTRACT_EFFECTS} - known

@@ -126,6 +126,13 @@ ROLLOUT_EFFECTS = {
         "the gain of the drive: with `gains: free` the two are reported as a pair",
         "the same motion with and without what is fixed to {at}", "MuJoCo, URDF and every simulator: it is an inertia",
     ),
+    "link_inertia": RolloutEffect(
+        "link inertia", "A link whose mass, centre of mass or inertia is not what the file says; asked after all else.",
+        "those of the link's ten numbers that the recordings tell, as a body can have them", "link",
+        {"mass": "kg", "mx, my, mz": "kg m", "ixx, ixy, iyy, ixz, iyz, izz": "kg m2"}, "", 0.0,
+        "payloads and rotors, where the link turns about nothing that moves", "the same motion with {at} weighed",
+        "MuJoCo, URDF and every simulator",
+    ),
     "joint_elasticity": RolloutEffect(
         "joint elasticity", "A spring between motor and link; the encoder reads the motor.",
         "tau_link = stiffness (q_motor - q_link)", "joint", {"stiffness": "N m/rad", "damping": "N m s/rad"}, "", 0.0,
