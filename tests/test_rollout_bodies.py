@@ -20,10 +20,12 @@ from figaroh_jax.rollouts.bodies import Link, body_notes, nearest_bodies, search
 from figaroh_jax.rollouts.causes import elastic_loop, elastic_table
 from figaroh_jax.rollouts.data import Run, Stretch
 from figaroh_jax.rollouts.fit import fit
+from figaroh_jax.rollouts.loop import brought_back
 from figaroh_jax.rollouts.parameters import Entry, put, values
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.search import Model, Search
 from figaroh_jax.rollouts.setting import Setting, Structure, setting
+from figaroh_jax.rollouts.task import simulated
 
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", Path(__file__).parents[2] / "shared" / "data"))
 DT, EVERY, SECONDS, NOISE = 0.001, 5, 6.0, 5e-4
@@ -201,3 +203,16 @@ def test_the_real_double_pendulum_has_its_inertia_about_its_joints(tmp_path: Pat
     for link, extra in (("Link1", 0.52346 * 0.2**2), ("Link2", 0.62557 * 0.25569**2)):
         assert abs(told[link,]["parameters"]["ixx"]["value"] + extra) < 0.1 * extra
     assert sum("about the joint" in note for note in answer["notes"]) == 2
+    assert answer["holdout"]["after"] < 0.5 * answer["holdout"]["before"]
+    assert sum("judged in windows of 0.3 s" in note for note in answer["notes"]) == 1
+
+
+def test_windows_of_a_robot_that_nothing_brings_back_begin_where_it_was_measured(tmp_path: Path):
+    (tmp_path / "robot.xml").write_text(pendulum(friction=0.02))
+    loop, run = load_loop(tmp_path / "robot.xml")[0], swung(pendulum(), 0)
+    assert not brought_back(loop).any()
+    whole, cut = simulated(loop, run), simulated(loop, run, 70)
+    assert len(cut) == len(run.time)
+    np.testing.assert_array_equal(cut[:70], whole[:70])
+    moved = [np.sqrt(np.mean((x - run.position)[600:] ** 2)) for x in (cut, whole)]
+    assert moved[0] < 0.2 * moved[1]
