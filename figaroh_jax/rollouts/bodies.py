@@ -23,15 +23,15 @@ from ..estimation.priors import rigid_prior
 from ..results import Name
 from ..rigid.inertia import from_com
 from .arm import baseline_alone
-from .causes import Candidate, Catalogue, catalogue
+from .causes import Candidate
 from .fit import Fit, System, fit
 from .gates import rms_of, standing
 from .loop import Loop, brought_back
-from .parameters import TEN, put, values
+from .parameters import TEN, Entry, put, values
 from .screening import Standing, excess_of
 from .search import Model, Named, Search, t_of, t_of_recordings
 from .sensitivity import Windows
-from .setting import Setting, Structure, by_recording, free_entries, largest_forces, thinned
+from .setting import Setting, Structure, by_recording, free_entries, thinned
 from .steady import most_unsteady
 from .thresholds import (
     BODY,
@@ -109,10 +109,9 @@ def _rigid(here: Setting, found: Search) -> _Rigid:
 
 
 def with_bodies(here: Setting, links: Sequence[int]) -> Setting:
-    """The setting with the ten numbers of links at the end of its table, which nothing frees yet."""
-    forces = largest_forces(here.loop, here.runs)
-    table = catalogue(here.loop, forces, gains_known=False, bodies=links).table
-    return replace(here, known=Catalogue(table, here.known.candidates))
+    """The setting with the ten numbers of links at the end of its table, but for those that are there already."""
+    more = [Entry(name, (i,)) for i in links for name in TEN if not _entries(here, i)]
+    return replace(here, known=here.known._replace(table=(*here.known.table, *more)))
 
 
 class Link(NamedTuple):
@@ -137,8 +136,9 @@ class _Look:
     """One linearisation of a model by all numbers of all links, and which of these the recordings tell."""
 
     def __init__(self, here: Setting, now: Model, free: Sequence[int]):
-        self.here, self.scale, self.places = here, _scale(here.loop), range(len(here.loop.robot.joints))
-        self.level = _level(now)
+        self.here, self.scale, self.level = here, _scale(here.loop), _level(now)
+        every = range(len(here.loop.robot.joints))
+        self.places = [i for i in every if not set(_entries(here, i)) & set(free)]  # others are fitted already
         self.columns = free_entries(free, [k for i in self.places for k in _entries(here, i)])
         low, high = here.bounds.T
         self.bound = [k for k in free if not low[k] < now.fit.theta[k] < high[k]]
@@ -220,25 +220,27 @@ def _links(here: Setting, found: _Rigid) -> tuple[list[Link], Standing]:
     free = [int(k) for k in found.last.free if k >= 0]
     structure = Structure(loop, table, here.cut(loop))
     now = standing(here, structure, _fitted(here, structure, theta, free), free)
-    links, model = list[Link](), now.model
-    while len(links) < len(loop.robot.joints):
-        best = _one_more(here, now, model, links)
+    steps = [(list[Link](), now.model)]
+    while len(steps) <= len(loop.robot.joints) and (not steps[1:] or steps[-1][1].excess >= 1.0):
+        best = _one_more(here, now, steps[-1][1], steps[-1][0])
         if best is None:
             break
-        links, model = best
-        if model.excess < 1.0:
-            break
-    if not links:
-        return [], now
-    links, model = _told_further(here, now, model, links)
-    new = _stands_as_bodies(here, now, model, links)
-    if new is None or not borne_out(here, now, new, MOST_OF_A_REST)[2]:
-        return [], now
+        steps.append(best)
+    for links, model in reversed(steps[1:]):  # fewer where no bodies have what all of them would
+        links, model = _told_further(here, now, model, links)
+        new = _stands_as_bodies(here, now, model, links)
+        if new is not None and borne_out(here, now, new, MOST_OF_A_REST)[2]:
+            return _needed(here, now, links, new)
+    return [], now
+
+
+def _needed(here: Setting, now: Standing, links: list[Link], new: Standing) -> tuple[list[Link], Standing]:
+    """The links without those that the others can spare, the least first."""
+    free = now.model.free
     while len(links) > 1:
         fewer, gone = [[x for x in links if x is not link] for link in links], set(free) - set(new.model.free)
-        least, other = min(
-            ((one, _with(here, now, new.model, one, gone)) for one in fewer), key=lambda one: one[1].fit.squares
-        )
+        models = [(one, _with(here, now, new.model, one, gone)) for one in fewer]
+        least, other = min(models, key=lambda one: one[1].fit.cost)
         without = _stands_as_bodies(here, now, other, least)
         if without is None or borne_out(here, without, new)[2]:
             break
@@ -252,10 +254,10 @@ def _one_more(here: Setting, now: Standing, model: Model, links: Sequence[Link])
     sets = [look.told([*taken, i]) for i in look.places if i not in taken]
     sets = sorted([one for one in sets if one[-1].entries], key=lambda one: -one[-1].promise)[:_TRIED]
     ends = [(one, _with(here, now, model, one, look.spare(one))) for one in sets]
-    best = min(ends, key=lambda one: one[1].fit.squares, default=None)
-    if best is None:
+    best = min(ends, key=lambda one: one[1].fit.cost, default=None)
+    if best is None or not np.isfinite(best[1].fit.cost):
         return None
-    links, new = best
+    new = best[1]
     return best if new.excess < 1.0 or new.fit.squares < (1 - GAIN_BESIDE_REST) * model.fit.squares else None
 
 
@@ -426,11 +428,9 @@ def _better(filed: Loop, whole: Setting, found: Search, some: Setting, other: Se
     numbers = {number: name for name, number in ROLLOUTS[EFFECT].in_rollouts.numbers}
     sizes, named = [rms_of(part, x.held) for x in (before, after)], list[Named]()
     for link in links:
-        at, reported = (
-            (whole.loop.robot.link_names[link.at],),
-            [numbers[whole.known.table[k].name] for k in link.entries],
-        )
-        one = Candidate(EFFECT, at, link.entries, (), tuple(reported))
+        at = (whole.loop.robot.link_names[link.at],)
+        reported = tuple(numbers[whole.known.table[k].name] for k in link.entries)
+        one = Candidate(EFFECT, at, link.entries, (), reported)
         by, share = most_unsteady(sound, structure, last, one)
         if after.excess.max() >= 1.0 and share > STEADY_OF_A_LINK:
             why = f"its size differs by {by} ({share:.2g} of what it explains), as that of what stands in for another"

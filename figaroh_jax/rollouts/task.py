@@ -22,7 +22,7 @@ from ..recordings.dataset import Recording, read_recordings
 from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, Experiment, Gain, Name, Rest, Trace, Verdict
 from .alone import inseparable, separable
 from .arm import search_arm
-from .bodies import body_notes, searched_with_bodies
+from .bodies import body_notes, fitted_links, searched_with_bodies, told_alone
 from .causes import BASELINE
 from .creep import REMARK, creep_notes, searched_with_both
 from .data import Run, Stretch, ahead_of_command, as_recorded, noise_of, regular, windows, without_gaps
@@ -34,7 +34,7 @@ from .reading import load_loop
 from .rest import nearest_of, parts_of, relative_rest
 from .search import Named, Search, search
 from .sensitivity import predicted
-from .setting import Setting, Structure, residuals, setting
+from .setting import Setting, Structure, begun, residuals, setting
 from .sizes import is_excepted, is_open, possible, told_errors
 from .thresholds import REFITTED
 
@@ -86,6 +86,9 @@ def diagnose_rollout_task(
     here = diagnosis_setting(task, loop, runs)
     notes = (*notes, *left_out(loop.robot, task.diagnose.forbid))
     with jax.enable_x64(True):
+        if fitted_links(here):
+            progress("fitting the links that the baseline names", 0.0)
+            here, _ = told_alone(here, begun(here))
         seek = search_arm if separable(loop) else search
         if loop.robot.nv > 1 and seek is search:
             progress(f"looking for one cause after another, which takes long: {inseparable(loop)}", 0.0)
