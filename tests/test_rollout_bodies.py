@@ -119,6 +119,23 @@ def test_a_link_that_is_drawn_is_found_and_a_detent_is_none(tmp_path: Path):
     assert "link_inertia" not in {n.candidate.effect for n in other.named}, told
 
 
+@pytest.mark.slow
+def test_a_link_of_an_arm_whose_centre_of_mass_lies_elsewhere_is_told(tmp_path: Path):
+    """By its name, its place and the moment that it has more (m times the shift), in a seed that is drawn."""
+    (tmp_path / "arm.xml").write_text(servo_arm6.model_text(1.6))
+    seed, runs = int(np.random.default_rng().integers(1, 10**6)), []
+    for number in range(4):
+        r = servo_arm6.record([("link_inertia", 3, 0.03)], seed, number)
+        runs.append(Run(f"run {number}", r["t"], r["u"], r["q"], None))
+    cut = [Stretch(k, first, 600) for k in range(4) for first in (0, 600)]
+    here = setting(load_loop(tmp_path / "arm.xml")[0], runs, stretches=cut)
+    found = searched_with_bodies(search_arm, here, search_arm(here))
+    link = here.loop.robot.joints[3].link
+    assert (found.verdict, list(sizes(found))) == ("named", [("link_inertia", link)]), seed
+    moment = 0.03 * servo_arm6.MASS[3]
+    assert abs(sizes(found)["link_inertia", link]["mx"] - moment) < 0.02 * moment, seed
+
+
 def test_numbers_of_links_stay_with_them_beside_a_spring(tmp_path: Path):
     """MuJoCo's arm with a hinge that is all but stiff is the arm without: so is ours, whatever its links carry."""
     (tmp_path / "arm.xml").write_text(servo_arm6.model_text())

@@ -155,7 +155,7 @@ def test_the_order_of_a_ripple_is_found(tmp_path: Path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("effect", servo_arm6.MORE)
+@pytest.mark.parametrize("effect", [name for name in servo_arm6.MORE if name != "link_inertia"])  # asked last
 def test_it_is_found_in_an_arm_and_unknown_where_it_is_forbidden(tmp_path: Path, effect: str):
     """At its place, by its size, with nothing beside it; seeds that no rule was made on."""
     (tmp_path / "arm.xml").write_text(servo_arm6.model_text(1.6))
