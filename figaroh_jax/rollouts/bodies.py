@@ -44,7 +44,17 @@ from .thresholds import (
     TOLD_OF_A_LINK,
 )
 
-__all__ = ["EFFECT", "body_notes", "consistent", "fitted_links", "searched_with_bodies", "told_alone"]
+__all__ = [
+    "EFFECT",
+    "Link",
+    "body_notes",
+    "consistent",
+    "fitted_links",
+    "nearest_bodies",
+    "searched_with_bodies",
+    "told_alone",
+    "with_bodies",
+]
 
 EFFECT = "link_inertia"
 _LOOKS = 4  # at most, at which numbers are told
