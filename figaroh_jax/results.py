@@ -17,6 +17,8 @@ __all__ = [
     "Estimate",
     "Experiment",
     "Gain",
+    "Links",
+    "MovedLink",
     "Name",
     "Nearest",
     "Part",
@@ -122,6 +124,28 @@ class Rest:
 
 
 @dataclass(frozen=True)
+class MovedLink:
+    """A link whose mass or inertia is another than the model file has, or a rotor that looks like one."""
+
+    name: Name  # link_inertia or rotor_inertia
+    share: float  # of what fitting all links gains: taken by this one and those before it
+    numbers: dict[str, Estimate]  # what is to be added to the file's, of those that data tell: kg, kg m, kg m2
+    instead: tuple[Name, ...] = ()  # what gains as much in its place
+    note: str = ""  # what the numbers look like
+
+
+@dataclass(frozen=True)
+class Links:
+    """How much of the simulation's error the links of the model file are, which the baseline fits before all causes."""
+
+    filed: Float[np.ndarray, " nv"]  # RMS residual of each joint with them, friction being fitted, N m or N
+    gain: Gain  # error on data not fitted, with the links of the file and with fitted ones
+    far: float  # how far they move, RMS of what the data tell, in stated one sigmas
+    trust: float  # the stated relative one sigma
+    moved: tuple[MovedLink, ...] = ()
+
+
+@dataclass(frozen=True)
 class Candidate:
     """What the data can say of one effect at one place, before any verdict."""
 
@@ -187,6 +211,7 @@ class Diagnosis(Selection):
     band: float | None = None  # Hz, that positions were taken down to (`prepare`): predictions want the same
     of_positions: bool = False  # a rollout: residuals and traces are positions, not torques
     remark: str = ""  # a sentence that the headline says besides what is missing
+    links: Links | None = None  # of the file, where the torque moves them further than they are believed
     refitted: tuple[str, ...] = ()  # numbers of the model file that the baseline's fit surely moved, in words
 
     @property

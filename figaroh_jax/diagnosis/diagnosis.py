@@ -19,7 +19,8 @@ from ..compiled.memory import give_back_holes
 from ..effects.base import place
 from ..effects.catalogue import CATALOGUE, find, related
 from ..effects.plausibility import implausible
-from ..formats.robotfile import load_robot, stated_baseline
+from ..formats.assembly import Welded
+from ..formats.robotfile import load_robot, stated_baseline, welded_to
 from ..recordings.bandwidth import note_on
 from ..recordings.checks import checked_recordings
 from ..recordings.dataset import Recording, read_recordings
@@ -43,6 +44,7 @@ from .holdout import kept_out_error, residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_rest, without_a_number
 from .judgement import KeptOut, Left, Searched, as_slow_noise, doubted_rest, reasons_against, standings_of, sticks_alone
 from .layout import describe_folds, repeats_not_said
+from .links import moved_links
 from .naming import LIKE_A_REST, ONE_PART, beyond_simpler, lone_part, strong
 from .reading import Reader, only_read
 from .rest import (
@@ -89,6 +91,7 @@ def diagnose_task(
         "trust": task.robot.trust,
         "forbid": task.diagnose.forbid,
         "alpha": task.diagnose.alpha,
+        "welded": welded_to(model, task),
     }
     options["tolerance"] = task.diagnose.tolerance.torque
     robot = make_backend(backend, model)
@@ -109,6 +112,7 @@ def diagnose(
     progress: Callable[[str, float], None] = lambda phase, share: None,
     seed: int = 0,
     contradictions: Sequence[str] = (),
+    welded: Sequence[Welded] = (),
 ) -> Diagnosis:
     """What the robot's model gets wrong in the recordings (joint side, SI units), named where it can be.
 
@@ -117,7 +121,8 @@ def diagnose(
     `forbid` names effects left out of the catalogue, `alpha` is the level of the test for the whole catalogue, and
     `tolerance` is the share of each joint's RMS torque below which a misfit is good enough to be `nothing`.
     `contradictions` say, in words, what of the recordings contradicts the model (`checked_recordings`): with any, or
-    where the links as fitted cannot be, nothing is named.
+    where the links as fitted cannot be, nothing is named. `welded` are bodies that the model's file fixes to its links:
+    whether one seems not to be there is told.
     """
     with jax.enable_x64(True):
         progress("preparing signals", 0.03)
@@ -139,7 +144,7 @@ def diagnose(
             if not contradictions and (cannot_be := _impossible(judged)):
                 judged = _judged(*asked, cannot_be)
             progress("measuring the gain", 0.9)
-            return _answer(searched.here, signals, searched.search, judged), again
+            return _answer(searched.here, signals, searched.search, judged, welded), again
 
         answer, again = answered(here)
         if again:
@@ -560,7 +565,9 @@ def _left(
     )
 
 
-def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judged: _Judged) -> Diagnosis:
+def _answer(
+    searched: Setting, signals: Sequence[Signals], search: Search, judged: _Judged, welded: Sequence[Welded]
+) -> Diagnosis:
     here, seen = judged.here, stand(searched.problem, searched.start, searched.whitening)
     named, joint, order, gains, holdout, *_ = judged.causes
     problem, model, last = here.problem, here.problem.model, joint.step
@@ -596,6 +603,7 @@ def _answer(searched: Setting, signals: Sequence[Signals], search: Search, judge
         baseline=fitted_model(problem, first.state, []),
         model=fitted_model(problem, last.state, joint.causes),
         rest=judged.rest,
+        links=moved_links(problem, first, last, here.whitening, welded),
         notes=(
             *_notes(signals, here, last),
             *([_LINKS_HELD] if judged.causes.links_held else []),

@@ -30,6 +30,7 @@ __all__ = [
     "kept_out_error",
     "part_error",
     "predicted",
+    "relative_error",
     "residual_rms",
     "traces",
     "weighted_of_errors",
@@ -159,6 +160,12 @@ def kept_out_error(problem: Problem, step: Step) -> Float[np.ndarray, "n M nv"]:
     else:
         error = _left_out(problem, state, _without_parts(problem, step), part)
     return error * _kept_out(problem)
+
+
+def relative_error(problem: Problem, step: Step) -> float:
+    """Relative RMS error (N m over N m, all joints) on data not fitted."""
+    torque = problem.torque * _kept_out(problem)
+    return float(np.sqrt((kept_out_error(problem, step) ** 2).sum() / max((torque**2).sum(), 1e-300)))
 
 
 def _blocks(problem: Problem) -> Int[np.ndarray, "n M"]:

@@ -83,6 +83,10 @@ IMPOSSIBLE = 3.0  # standard deviations below zero of a link's mass: no such bod
 BEYOND_ANY = 30.0  # times its stated one sigma that a fit moves a link's parameter: the recordings are of another robot
 # (or unit); UR10e's moments move by 18, the other public sets' by 10
 BEYOND_TRUST = 0.01  # p-value of the squares of their deviations: below, they are not as believed
+GAIN_OF_A_LINK = 0.02  # of what all links gain on folds left out: what one more must gain, and up to which two do alike
+AS_IF_GONE = 0.25  # of a body that the file fixes to a link: how far what is missing may be from all of it
+SURELY = 2.0  # standard deviations of a link's number that is told
+MOST_MOVED = 4  # links that are told to be others than the file says
 
 # The rest (`rest`)
 REST_P = 0.01  # p-value of a rest

@@ -25,10 +25,12 @@ __all__ = [
     "LinkPart",
     "Posture",
     "Root",
+    "Welded",
     "assemble",
     "displacement",
     "refuse_many",
     "translation",
+    "welded_bodies",
 ]
 
 Posture = Mapping[str, float | Sequence[float]]  # a number for a revolute or prismatic joint, its part of q for others
@@ -68,6 +70,14 @@ class FramePart(NamedTuple):
     name: str
     link: str  # name of the link that it is fixed to
     placement: Float[np.ndarray, "4 4"]  # in the link's frame
+
+
+class Welded(NamedTuple):
+    """A body that a file fixes to a moving link, with all that it carries."""
+
+    name: str
+    at: int  # index of the joint that moves it
+    inertia: Float[np.ndarray, "10"]  # at and in that joint's frame
 
 
 class _Drive(NamedTuple):
@@ -110,6 +120,30 @@ def assemble(
             return _sound(build.finish(name, joints, _gravity(gravity)))
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
+
+
+def welded_bodies(robot: RobotModel, parts: tuple[Sequence[LinkPart], Sequence[JointPart]]) -> tuple[Welded, ...]:
+    """The bodies with a mass that the file of a robot fixes to a moving link, each with all that it carries there.
+
+    `parts` are those that the robot is assembled from. A frame without a mass that carries a body is not told besides.
+    """
+    frames = zip(robot.frames, np.asarray(robot.frame_placement), strict=True)
+    places = {frame.name: (frame.parent, pose) for frame, pose in frames}
+    moved, carrier = {joint.link for joint in robot.joints}, {joint.child: joint.parent for joint in parts[1]}
+    whole: dict[str, np.ndarray] = {}
+    for link in parts[0]:
+        at, pose = places.get(link.name, (-1, np.eye(4)))
+        holder: str | None = link.name
+        while at >= 0 and holder is not None and holder not in moved:
+            own = inertia.transform(np.asarray(link.inertia), pose)
+            whole[holder] = whole.get(holder, np.zeros(10)) + own
+            holder = carrier.get(holder)
+    inner = {carrier.get(name): ten for name, ten in whole.items() if ten[0] > 0}
+    return tuple(
+        Welded(name, places[name][0], ten)
+        for name, ten in whole.items()
+        if ten[0] > 0 and not (name in inner and np.allclose(ten, inner[name], rtol=0, atol=1e-12))
+    )
 
 
 def refuse_many(source: str, what: str, count: int) -> None:

@@ -40,6 +40,7 @@ __all__ = [
     "engine",
     "joint_names",
     "load_mjcf",
+    "mjcf_parts",
 ]
 
 _KINDS: tuple[Kind, ...] = ("free", "spherical", "prismatic", "revolute")  # in the order of MuJoCo's numbers
@@ -215,7 +216,7 @@ def compiled_robot(
     """Model of a compiled `mujoco.MjModel`; `source` names it in messages. See `load_mjcf`."""
     try:
         with np.errstate(all="ignore"):  # `assemble` checks what comes of it
-            links, parts, frames = _parts(mj, root)
+            links, parts, frames = mjcf_parts(mj, root)
         free = [part.name for part in parts if part.kind == "free"]
         if root == "fixed" and (named := [name for name in joints or () if name in free]):
             raise InputError(f"joints: joint '{named[0]}' is free, but root is fixed")
@@ -272,7 +273,8 @@ def _pose(position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) 
     return displacement("free", np.zeros(3), np.concatenate([position, np.roll(quaternion, -1)]))
 
 
-def _parts(mj: Any, root: Root | None) -> tuple[list[LinkPart], list[JointPart], list[FramePart]]:
+def mjcf_parts(mj: Any, root: Root | None) -> tuple[list[LinkPart], list[JointPart], list[FramePart]]:
+    """Links, joints and frames of a compiled `mujoco.MjModel`."""
     names, bodies = joint_names(mj), [body_name(mj, i) for i in range(mj.nbody)]
     followers = _followers(mj, names)
     links, joints, frames = [LinkPart("world", np.zeros(10))], [], []

@@ -18,19 +18,29 @@ from ..effects.catalogue import find
 from ..effects.extended import ExtendedModel, extend
 from ..errors import InputError
 from ..rigid.model import RobotModel
-from .assembly import LARGEST_NUMBER, Posture, Root
+from .assembly import LARGEST_NUMBER, Posture, Root, Welded, welded_bodies
 from .compensation import GravityCompensation
 from .files import model_format
-from .mjcf import actuator_of, body_name, compile_mjcf, compiled_robot, disabled, engine, joint_names, load_mjcf
+from .mjcf import (
+    actuator_of,
+    body_name,
+    compile_mjcf,
+    compiled_robot,
+    disabled,
+    engine,
+    joint_names,
+    load_mjcf,
+    mjcf_parts,
+)
 from .native import place_names
-from .urdf import load_urdf, said_twice, urdf_dynamics
-from .usd import load_usd, usd_joints
+from .urdf import load_urdf, said_twice, urdf_dynamics, urdf_parts
+from .usd import load_usd, usd_joints, usd_parts
 from .xmlfile import find_in_packages
 
 if TYPE_CHECKING:
     from .config import Baseline, Task
 
-__all__ = ["Loaded", "load_extended", "load_robot", "read_robot", "stated_baseline"]
+__all__ = ["Loaded", "load_extended", "load_robot", "read_robot", "stated_baseline", "welded_to"]
 
 
 class Loaded(NamedTuple):
@@ -127,6 +137,14 @@ def load_robot(task: Task) -> RobotModel:
     from .config import robot_options
 
     return read_robot(task.robot.model, **robot_options(task.robot))
+
+
+def welded_to(robot: RobotModel, task: Task) -> tuple[Welded, ...]:
+    """What the model file of a task fixes to the moving links of its robot: hands, cameras, covers."""
+    file, root, form = find_in_packages(task.robot.model, ()), task.robot.root, model_format(task.robot.model)
+    if form == "urdf":
+        return welded_bodies(robot, urdf_parts(file)[1])
+    return welded_bodies(robot, usd_parts(file, root) if form == "usd" else mjcf_parts(compile_mjcf(file), root)[:2])
 
 
 def stated_baseline(task: Task) -> tuple[Baseline, tuple[str, ...]]:

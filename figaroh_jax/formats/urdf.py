@@ -18,7 +18,7 @@ from ..rigid.model import Kind, RobotModel
 from .assembly import JointPart, LinkPart, Posture, Root, assemble, refuse_many
 from .xmlfile import find_in_packages, read_xml
 
-__all__ = ["load_urdf", "said_twice", "urdf_dynamics"]
+__all__ = ["load_urdf", "said_twice", "urdf_dynamics", "urdf_parts"]
 
 _KINDS: dict[str, Kind | Literal["fixed"]] = {
     "revolute": "revolute",
@@ -81,16 +81,20 @@ def load_urdf(
     ('waist', 'shoulder', 'elbow', 'wrist')
     """
     path = find_in_packages(path, packages)
+    name, parts = urdf_parts(path)
+    return assemble(str(path), name, parts, joints, posture, gravity, root)
+
+
+def urdf_parts(path: str | Path) -> tuple[str, tuple[list[LinkPart], list[JointPart]]]:
+    """Name of the robot in a URDF file, its links and its joints."""
     robot = _read(path)
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # `assemble` checks what comes of it
-            parts = (
-                [_link(link) for link in robot.iterchildren("link")],
-                [_joint(joint) for joint in robot.iterchildren("joint")],
-            )
+            links = [_link(link) for link in robot.iterchildren("link")]
+            joints = [_joint(joint) for joint in robot.iterchildren("joint")]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    return assemble(str(path), robot.get("name") or Path(path).stem, parts, joints, posture, gravity, root)
+    return robot.get("name") or Path(path).stem, (links, joints)
 
 
 def urdf_dynamics(path: str | Path) -> dict[str, tuple[float, float]]:

@@ -21,7 +21,7 @@ from .assembly import ROOT_JOINT, FramePart, JointPart, LinkPart, Posture, Root,
 from .usd_stage import DEGREE, ROTATIONS, TRANSLATIONS, Edge, Stage, body_inertia, name_of, reading, schemas, value
 from .xmlfile import find_in_packages
 
-__all__ = ["UsdJoint", "load_usd", "usd_joints"]
+__all__ = ["UsdJoint", "load_usd", "usd_joints", "usd_parts"]
 
 
 class UsdJoint(NamedTuple):
@@ -77,6 +77,15 @@ def load_usd(
     if free and joints is not None and free not in joints:
         joints = [free, *joints]
     return assemble(str(file), stage.name, (links, parts), joints, posture, own, "fixed", frames)
+
+
+def usd_parts(
+    path: str | Path, root: Root | None = None, packages: Sequence[str | Path] = ()
+) -> tuple[list[LinkPart], list[JointPart]]:
+    """Links and joints of the one robot of a stage."""
+    file = find_in_packages(path, packages)
+    with reading(file):
+        return _parts(Stage(file), root)[:2]
 
 
 def usd_joints(path: str | Path, packages: Sequence[str | Path] = ()) -> tuple[dict[str, UsdJoint], tuple[str, ...]]:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..results import Cause, Diagnosis, Estimate, Name, Rest, finite
+from ..results import Cause, Diagnosis, Estimate, Gain, Links, Name, Rest, finite
 
-__all__ = ["answer", "cause", "holdout", "rest", "to_json", "write_predictions"]
+__all__ = ["answer", "cause", "holdout", "links", "rest", "to_json", "write_predictions"]
 
 
 def answer(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -28,6 +28,7 @@ def answer(diagnosis: Diagnosis) -> dict[str, Any]:
         },
         "rest": rest(diagnosis.rest),
         "holdout": holdout(diagnosis),
+        **({} if diagnosis.links is None else {"links": links(diagnosis.links)}),
         "next_experiment": _experiment(diagnosis),
         "notes": list(diagnosis.notes),
     }
@@ -76,15 +77,37 @@ def write_predictions(
 
 def cause(found: Cause) -> dict[str, Any]:
     """A cause as it stands in `answer.json`."""
-    gain = found.gain
     return {
         **_name(found.name),
         "parameters": {name: _estimate(estimate) for name, estimate in found.parameters.items()},
         "found": found.found,
         "confidence": finite(found.confidence),
-        "gain": {"holdout_before": finite(gain.before), "holdout_after": finite(gain.after), "unit": gain.unit},
+        "gain": _gain(found.gain),
         "ambiguous_with": [_name(other) for other in found.ambiguous_with],
     }
+
+
+def links(own: Links) -> dict[str, Any]:
+    """How far the links of the model file are off, as it stands in `answer.json`."""
+    return {
+        "residual": [finite(value) for value in own.filed],
+        "gain": _gain(own.gain),
+        "sigmas": finite(own.far),
+        "moved": [
+            {
+                **_name(one.name),
+                "share": finite(one.share),
+                "parameters": {name: _estimate(estimate) for name, estimate in one.numbers.items()},
+                "instead": [_name(other) for other in one.instead],
+                "note": one.note,
+            }
+            for one in own.moved
+        ],
+    }
+
+
+def _gain(gain: Gain) -> dict[str, Any]:
+    return {"holdout_before": finite(gain.before), "holdout_after": finite(gain.after), "unit": gain.unit}
 
 
 def rest(left: Rest) -> dict[str, Any]:

@@ -43,6 +43,7 @@ class _Joint(NamedTuple):
 
     name: str
     unit: str
+    filed: float | None  # with the links of the model file, where these are told
     before: float
     after: float
     noise: float
@@ -105,6 +106,7 @@ def _page(diagnosis: Diagnosis, title: str, folder: Path | None = None) -> str:
         anatomy=_anatomy(diagnosis),
         badge=_UNDECIDED if diagnosis.rest.undecided else BADGES[diagnosis.verdict],
         undecided=_glued(wording.undecided(diagnosis)),
+        links=[*map(_glued, wording.links(diagnosis))],
         unexplained=_glued(wording.unexplained(diagnosis)) if diagnosis.verdict in ("named+rest", "unknown") else "",
         sentence=_glued(wording.sentence(diagnosis, title)),
         largest=max(_finite(gain.before), _finite(gain.after)),
@@ -192,7 +194,8 @@ def _joints(diagnosis: Diagnosis) -> list[_Joint]:
         before, after, noise = (float(row[index]) for row in rows)
         causes = [wording.effect_title(cause.name.effect) for cause in diagnosis.causes if name in cause.name.at]
         felt = [(label, float(rms[index])) for label, rms in shares.items() if rms[index] > 1e-3 * max(before, 1e-12)]
-        joints.append(_Joint(name, unit, before, after, noise, causes, felt, name in opened))
+        filed = None if diagnosis.links is None else float(diagnosis.links.filed[index])
+        joints.append(_Joint(name, unit, filed, before, after, noise, causes, felt, name in opened))
     return joints
 
 

@@ -105,6 +105,10 @@ def summary(diagnosis: Diagnosis, robot: str = "the robot", *, verbose: bool = F
     if diagnosis.rest.nearest:
         parts.append(Text("\nConsidered, but not named:"))
         parts += [Padding(Text(wording.nearest(near)), (0, 0, 0, 3), expand=False) for near in diagnosis.rest.nearest]
+    if diagnosis.links is not None:
+        first, *others = wording.links(diagnosis)
+        parts.append(Text(f"\n{first}"))
+        parts += [Padding(Text(one), (0, 0, 0, 3), expand=False) for one in others]
     parts += [Text(), _residuals(diagnosis), Text()]
     parts.append(Text(f"Held out: {diagnosis.holdout_scheme}. {wording.p_value(diagnosis.p_value)}.", style="dim"))
     if diagnosis.experiment is not None:
@@ -185,15 +189,14 @@ def _aligned(parameters: Mapping[str, Estimate]) -> list[str]:
 def _residuals(diagnosis: Diagnosis) -> RenderableType:
     table = Table(box=None, pad_edge=False, header_style="dim")
     table.add_column("RMS residual")
-    for title in ("before", "after", "noise"):
+    columns = {"before": diagnosis.before, "after": diagnosis.after, "noise": diagnosis.noise}
+    if diagnosis.links is not None:
+        columns = {"links of the file": diagnosis.links.filed} | columns
+    for title in columns:
         table.add_column(title, justify="right")
     table.add_column("")
-    rows = zip(
-        diagnosis.joints, diagnosis.before, diagnosis.after, diagnosis.noise, diagnosis.torque_units, strict=True
-    )
-    for joint, before, after, noise, unit in rows:
-        values = (wording.number(float(value), 3) for value in (before, after, noise))
-        table.add_row(Text(joint), *values, unit)
+    for joint, unit, *values in zip(diagnosis.joints, diagnosis.torque_units, *columns.values(), strict=True):
+        table.add_row(Text(joint), *(wording.number(float(value), 3) for value in values), unit)
     return table
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..effects.catalogue import CATALOGUE
-from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, Name, Nearest, Part
+from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, MovedLink, Name, Nearest, Part
 from .rollout_effects import ROLLOUT_EFFECTS
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ __all__ = [
     "fitted",
     "interval",
     "level",
+    "links",
+    "moved",
     "nearest",
     "number",
     "p_value",
@@ -44,11 +46,57 @@ __all__ = [
 ]
 
 _NORMAL_95 = 1.96  # standard deviations on each side of a 95 % interval
+_MOST = 2 / 3  # of what all links gain: those that come first and take as much are told in the headline
 _SURE = 0.05  # p-value below which it stands beside what is not noise alone
 
 
 def sentence(diagnosis: Diagnosis, robot: str) -> str:
-    """The verdict in one sentence, e.g. "The simulation of tx40 is missing rotor inertia at joint_3: ..."."""
+    """The verdict in one sentence, e.g. "The simulation of tx40 is missing rotor inertia at joint_3: ...".
+
+    A second one says so where the links of the model file are others than the torque asks for.
+    """
+    return " ".join(filter(None, (_verdict(diagnosis, robot), _filed(diagnosis))))
+
+
+def _filed(diagnosis: Diagnosis) -> str:
+    """That the links of the file are not as the torque has them, and what the most of it looks like; may be empty."""
+    links = diagnosis.links
+    if links is None or diagnosis.rest.contradicts:
+        return ""
+    first = links.moved[: next((k for k, one in enumerate(links.moved, 1) if one.share > _MOST), len(links.moved))]
+    gone = [one.note for one in first if one.note.startswith("as if ")]
+    told = f"is {gone[0]}" if gone else f"looks like {_join([phrase(one.name) for one in first], 'and')}"
+    before, after = fall(links.gain.before, links.gain.after, links.gain.unit)
+    return (
+        f"Masses and inertias of its links are fitted: with those of the model file the error on held-out data is"
+        f" {before}, with fitted ones {after}{f'; most of that {told}' if first else ''}."
+    )
+
+
+def links(diagnosis: Diagnosis) -> list[str]:
+    """How far the links of the model file are off and which of them, in sentences; empty where they are as believed."""
+    own = diagnosis.links
+    if own is None:
+        return []
+    before, after = fall(own.gain.before, own.gain.after, own.gain.unit)
+    return [
+        f"Links of the model file: with them the error on held-out data is {before}, with fitted ones {after}. The"
+        f" torque moves them {number(own.far, 2)} times as far as robot.trust ({number(100 * own.trust, 3)} %) lets"
+        " expect; a wrong gain of the torque at a joint does that too.",
+        *map(moved, own.moved),
+    ]
+
+
+def moved(one: MovedLink) -> str:
+    """A link or rotor that is another than the model file has: where, its numbers, what these look like, what else it
+    may be, and how much of the gain of all links it takes with those before it."""
+    sizes = ", ".join(f"{name} {interval(value)}" for name, value in one.numbers.items())
+    instead = f"{_join([phrase(other) for other in one.instead], 'or')} does as well" if one.instead else ""
+    share = f"with it {100 * one.share:.0f} % of the difference"
+    return f"{phrase(one.name)}: {'; '.join(filter(None, (sizes, one.note, instead, share)))}"
+
+
+def _verdict(diagnosis: Diagnosis, robot: str) -> str:
     subject = f"The simulation of {robot}"
     if diagnosis.rest.contradicts:
         first, *others = diagnosis.rest.contradicts
@@ -64,7 +112,7 @@ def sentence(diagnosis: Diagnosis, robot: str) -> str:
                 f"No effect can be named that the simulation of {robot} is missing, but these data do not show that it"
                 f" is right: {undecided(diagnosis)} {told}"
             )
-        agrees = f"{subject} agrees with the data{_once(diagnosis.refitted)}: no missing effect is detectable"
+        agrees = f"{subject} agrees with the data{_once(diagnosis)}: no missing effect is detectable"
         if not diagnosis.rest.tolerated:
             return f"{agrees}, and the residual is consistent with noise {told}"
         surely = f" ({p_value(diagnosis.p_value)})" if diagnosis.p_value < _SURE else ""
@@ -77,8 +125,11 @@ def sentence(diagnosis: Diagnosis, robot: str) -> str:
     return " ".join(filter(None, (f"{subject} is missing {_list(diagnosis.causes)}: {fall}{rest}.", diagnosis.remark)))
 
 
-def _once(refitted: Sequence[str]) -> str:
+def _once(diagnosis: Diagnosis) -> str:
     """Which numbers of the file had to be others before the simulation agreed; empty where none had to."""
+    if diagnosis.links is not None:
+        return " once the masses and inertias of its links are fitted"
+    refitted = diagnosis.refitted
     more = f" and {len(refitted) - 1} more {'number is' if len(refitted) == 2 else 'numbers are'} fitted"
     return f" once the {refitted[0]}{more if len(refitted) > 1 else ''}" if refitted else ""
 

@@ -8,7 +8,6 @@ better, and where a body can have what was found: numbers that imitate another e
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,12 +15,10 @@ import equinox as eqx
 import numpy as np
 
 from ..effects.catalogue import ROLLOUTS
-from ..errors import InputError
-from ..estimation.conic import Constraints, NotConverged, constrained
+from ..estimation.conic import NotConverged
 from ..estimation.consistency import bodies, inconsistencies, project
-from ..estimation.priors import rigid_prior
+from ..estimation.told import ABOUT_JOINT, beside, bodies_with, inertia_about_joint, sizes, told_numbers
 from ..results import Name
-from ..rigid.inertia import from_com
 from .arm import baseline_alone
 from .causes import Candidate
 from .fit import Fit, System, fit
@@ -33,16 +30,7 @@ from .search import Model, Named, Search, t_of, t_of_recordings
 from .sensitivity import Windows
 from .setting import Setting, Structure, by_recording, free_entries, thinned
 from .steady import most_unsteady
-from .thresholds import (
-    BODY,
-    GAIN,
-    GAIN_BESIDE_REST,
-    MOST_OF_A_REST,
-    STEADY_OF_A_LINK,
-    T_BESIDE_REST,
-    T_WITHOUT_REST,
-    TOLD_OF_A_LINK,
-)
+from .thresholds import BODY, GAIN, GAIN_BESIDE_REST, MOST_OF_A_REST, STEADY_OF_A_LINK, T_BESIDE_REST, T_WITHOUT_REST
 
 __all__ = [
     "EFFECT",
@@ -59,7 +47,6 @@ __all__ = [
 EFFECT = "link_inertia"
 _LOOKS = 4  # at most, at which numbers are told
 _NO_OTHER = 1e-5  # of what a number does: what others cannot do as well, where it is one of them
-_STEINER = 0.15  # of what moving an inertia adds: what a number may differ from it by
 _EARLY = 0.25  # of a window's rows, that are fitted first
 _TRIED = 3  # links that are fitted in a round
 _MOST = 80  # iterations: links that are far off take many
@@ -137,16 +124,11 @@ def _entries(here: Setting, link: int) -> list[int]:
     return [k for k, e in enumerate(here.known.table) if e.name in TEN and e.at == (link,)]
 
 
-def _scale(loop: Loop) -> np.ndarray:
-    """Sizes of the ten numbers of each link (links, 10): kg, kg m, kg m2."""
-    return 1 / np.sqrt(rigid_prior(loop.robot, 1.0)[1]).reshape(-1, 10)
-
-
 class _Look:
     """One linearisation of a model by all numbers of all links, and which of these the recordings tell."""
 
     def __init__(self, here: Setting, now: Model, free: Sequence[int]):
-        self.here, self.scale, self.level = here, _scale(here.loop), _level(now)
+        self.here, self.scale, self.level = here, sizes(here.loop.robot), _level(now)
         every = range(len(here.loop.robot.joints))
         self.places = [i for i in every if not set(_entries(here, i)) & set(free)]  # others are fitted already
         self.columns = free_entries(free, [k for i in self.places for k in _entries(here, i)])
@@ -165,21 +147,13 @@ class _Look:
         The noise is taken as large as all that is left. Masses come last: where a link turns about what moves, its mass
         is as good as a moment of what carries it. What is not told stays as the file has it.
         """
-        found, others = {i: Link(i, (), 0.0) for i in links}, list(self.others)
         if not self.finite:
-            return list(found.values())
-        for numbers in (range(1, 10), (0,)):
-            for i in links:
-                entries = [_entries(self.here, i)[k] for k in numbers]
-                own = [self.columns.index(k) for k in entries]
-                information, score = _beside(self.matrix, self.right, own, others)
-                kept = _kept(information, self.scale[i][list(numbers)], self.level)
-                step = np.linalg.solve(information[np.ix_(kept, kept)], score[kept])
-                one = found[i]
-                new = (*one.entries, *(entries[k] for k in kept))
-                found[i] = Link(i, new, one.promise + float(score[kept] @ step))
-                others += [own[k] for k in kept]
-        return list(found.values())
+            return [Link(i, (), 0.0) for i in links]
+        entries = [_entries(self.here, i) for i in links]
+        tens = [[self.columns.index(k) for k in ten] for ten in entries]
+        found = told_numbers(self.matrix, self.right, tens, self.others, self.scale[list(links)], self.level)
+        own = zip(links, entries, found, strict=True)
+        return [Link(i, tuple(ten[k] for k in told), promise) for i, ten, (told, promise) in own]
 
     def spare(self, links: Sequence[Link]) -> set[int]:
         """Free numbers on their bounds whose part these links' numbers take: a rotor of none that turns with a link."""
@@ -187,36 +161,9 @@ class _Look:
             return set()
         others = [*self.others, *(self.columns.index(k) for link in links for k in link.entries)]
         at = [(k, self.columns.index(k)) for k in self.bound]
-        left = [(k, _beside(self.matrix, self.right, [c], others)[0][0, 0] / self.matrix[c, c]) for k, c in at
+        left = [(k, beside(self.matrix, self.right, [c], others)[0][0, 0] / self.matrix[c, c]) for k, c in at
                 if self.matrix[c, c] > 0]  # fmt: skip
         return {k for k, share in left if share < _NO_OTHER}
-
-
-def _beside(
-    matrix: np.ndarray, right: np.ndarray, own: Sequence[int], others: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Information and score of some columns, the others being solved for."""
-    others = [k for k in others if matrix[k, k] > 0]
-    size = np.sqrt(np.diag(matrix)[others])
-    inner = matrix[np.ix_(others, others)] / np.outer(size, size) + 1e-12 * np.eye(len(others))
-    both = np.column_stack([matrix[np.ix_(others, own)], right[others]]) / size[:, None]
-    solved = np.linalg.lstsq(inner, both, rcond=1e-12)[0]
-    cross = matrix[np.ix_(others, own)] / size[:, None]
-    return matrix[np.ix_(own, own)] - cross.T @ solved[:, :-1], right[own] - cross.T @ solved[:, -1]
-
-
-def _kept(information: np.ndarray, scale: np.ndarray, level: float) -> list[int]:
-    """Numbers that are told to a share of their size: the worst told are left out one after another, masses first."""
-    sized = information * np.outer(scale, scale)
-    kept = [k for k in range(len(scale)) if sized[k, k] > 0]
-    while kept:
-        own = sized[np.ix_(kept, kept)]
-        spread = np.sqrt(level * np.diag(np.linalg.inv(own + 1e-12 * np.trace(own) * np.eye(len(kept)))))
-        if spread.max() <= TOLD_OF_A_LINK:
-            break
-        worst = max(range(len(kept)), key=lambda k: (min(spread[k], 1e3 * TOLD_OF_A_LINK), -kept[k]))
-        del kept[worst]
-    return kept
 
 
 def _links(here: Setting, found: _Rigid) -> tuple[list[Link], Standing]:
@@ -366,7 +313,7 @@ def nearest_bodies(here: Setting, model: Model, links: Sequence[Link]) -> Model 
         return model
     columns, entries = [int(k) for k in last.free if k >= 0], [k for link in links for k in link.entries]
     own, others = ([columns.index(k) for k in ks] for ks in (entries, [k for k in columns if k not in entries]))
-    information, _ = _beside(*System(last.sums, structure.data, last.start).reduced(1e-6), own, others)
+    information, _ = beside(*System(last.sums, structure.data, last.start).reduced(1e-6), own, others)
     at = [10 * places.index(structure.table[k].at[0]) + TEN.index(structure.table[k].name) for k in entries]
     away = _moved_to_bodies(loop, places, ten[places], at, information, _level(model))
     if away is None:
@@ -384,16 +331,12 @@ def _moved_to_bodies(
     loop: Loop, places: Sequence[int], ten: np.ndarray, told: Sequence[int], information: np.ndarray, level: float
 ) -> np.ndarray | None:
     """What makes bodies of links (links, 10): the numbers that are `told` stay if they can, else move by least."""
-    scale, every = _scale(loop)[places].ravel(), bodies(loop.robot)
+    found = bodies_with(loop.robot, places, ten, told)
+    if found is not None:
+        return found - ten
+    scale, every = sizes(loop.robot)[list(places)].ravel(), bodies(loop.robot)
     mine = [replace(every[i], columns=tuple(range(10 * k, 10 * k + 10))) for k, i in enumerate(places)]
     own = np.diag(np.sqrt(level) / scale)
-    factor = np.column_stack([own, own @ ten.ravel()])
-    with suppress(InputError):
-        kept = np.eye(len(own))[list(told)]
-        found = constrained(factor, Constraints(mine, equal=(kept, ten.ravel()[list(told)])), scale)
-        found[list(told)] = ten.ravel()[list(told)]
-        if not inconsistencies(found.reshape(-1, 10), [body.name for body in mine]):
-            return found.reshape(-1, 10) - ten
     values, vectors = np.linalg.eigh(information)
     seen = np.zeros((len(told), len(own)))
     seen[:, list(told)] = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
@@ -500,22 +443,13 @@ def body_notes(here: Setting, found: Search) -> dict[Name, str]:
 
 
 def _about_joint(loop: Loop, found: Search, one: Candidate, i: int) -> str:
-    """Whether a link has too much of just what moving its inertia from its centre of mass to its joint adds.
-
-    Steiner's theorem: m (|c|^2 E - c c'). A file that states the inertia about the joint has it twice.
-    """
-    ten, theta = np.asarray(loop.robot.inertia)[i], found.last.theta
-    moved = from_com(ten[0], ten[1:4] / max(ten[0], 1e-12), np.zeros((3, 3)))
-    numbers = [k for k in one.entries if found.structure.table[k].name.startswith("inertia_")]
-    expected = np.array([-moved[TEN.index(found.structure.table[k].name)] for k in numbers])
-    if not len(numbers) or not np.abs(expected).max() > _STEINER * np.abs(moved[4:]).max():
-        return ""
-    if np.abs(theta[numbers] - expected).max() > _STEINER * np.abs(expected).max():
-        return ""
-    return (
-        "the file has too much of just what moving the inertia from the centre of mass to the joint adds (m c2): it may"
-        " state it about the joint, where it is to stand about the centre of mass"
-    )
+    """What is said where the file seems to state a link's inertia about its joint; else nothing."""
+    change, told = np.zeros(10), list[int]()
+    for k in one.entries:
+        told.append(TEN.index(found.structure.table[k].name))
+        change[told[-1]] = found.last.theta[k]
+    about = inertia_about_joint(np.asarray(loop.robot.inertia)[i], change, told)
+    return ABOUT_JOINT if about else ""
 
 
 def fitted_links(here: Setting) -> list[Link]:

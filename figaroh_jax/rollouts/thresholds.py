@@ -16,7 +16,6 @@ T_BESIDE_REST = 3.0  # t, where more than noise stays beside it
 GAIN_BESIDE_REST = 0.25  # less may stand in for the rest; not of what every joint has
 SMALL = 0.002  # gain below which a cause found with others is not missed
 STEADY = (0.004, 0.05)  # of what a cause explains: what sizes by position or speed, by time or recording, explain more
-TOLD_OF_A_LINK = 0.3  # of a link's own mass, moment or inertia: standard deviation up to which it is fitted
 MOST_OF_A_REST = 0.67  # gain of wrong links beside a rest: their numbers make up for half of many another effect
 STEADY_OF_A_LINK = 0.1  # of what a wrong link explains: what sizes by position, speed, time or recording explain more
 BODY = 0.01  # of what wrong links explain: what links that bodies can have may explain less
