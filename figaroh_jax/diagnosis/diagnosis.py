@@ -284,7 +284,8 @@ def _told_apart(here: Setting, found: list[Found], joint: Joint) -> tuple[list[F
     problem, start, whitening = here.problem, here.start, here.whitening
     for k, one in enumerate(found if problem.held.any() else ()):
         for other in one.instead:
-            if not physical_sign(other.effect) or other.name in [f.name for f in found]:
+            known = problem.trust <= other.effect.needs_trust  # else it is no cause
+            if not (known and physical_sign(other.effect)) or other.name in [f.name for f in found]:
                 continue
             both = sorted({*one.joints} & {*other.joints})
             fits = ([x if at == k else e for at, e in enumerate(joint.causes)] for x in (joint.causes[k], other.effect))

@@ -221,7 +221,8 @@ def _which(about: _About) -> list[MovedLink]:
         best = _simplest(about, now, ends, few)
         if not now.ones and size.surely() and size.squares < about.free + few and not about.bodies(best):
             return _told(about, size, {size.ones[0]: (min((begun - size.squares) / whole, 1.0), ())})
-        alike = [e.ones[-1] for e in ends if e.ones[-1] not in best.ones and e.squares - best.squares < few]
+        others = [*ends, size] if not now.ones and size.surely() else ends
+        alike = [e.ones[-1] for e in others if e.ones[-1] not in best.ones and e.squares - best.squares < few]
         for count in range(len(now.ones) + 1, len(best.ones) + 1):
             part = best if count == len(best.ones) else about.left(best.ones[:count])
             share = min(max((begun - part.squares) / whole, 0.0), 1.0)
