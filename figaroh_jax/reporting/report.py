@@ -109,7 +109,9 @@ def _page(diagnosis: Diagnosis, title: str, folder: Path | None = None) -> str:
         links=[*map(_glued, wording.links(diagnosis))],
         unexplained=_glued(wording.unexplained(diagnosis)) if diagnosis.verdict in ("named+rest", "unknown") else "",
         sentence=_glued(wording.sentence(diagnosis, title)),
-        largest=max(_finite(gain.before), _finite(gain.after)),
+        largest=max(
+            _finite(x) for x in (gain.before, gain.after, diagnosis.links.gain.before if diagnosis.links else 0.0)
+        ),
         joints=_joints(diagnosis),
         rests=_rests(diagnosis),
         largest_rest=max([_finite(float(x)) for x in diagnosis.rest.relative], default=0.0),

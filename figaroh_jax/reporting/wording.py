@@ -65,11 +65,11 @@ def _filed(diagnosis: Diagnosis) -> str:
         return ""
     first = links.moved[: next((k for k, one in enumerate(links.moved, 1) if one.share > _MOST), len(links.moved))]
     gone = [one.note for one in first if one.note.startswith("as if ")]
-    told = f"is {gone[0]}" if gone else f"looks like {_join([phrase(one.name) for one in first], 'and')}"
+    told = gone[0] if gone else f"by what looks like {_join([phrase(one.name) for one in first], 'and')}"
     before, after = fall(links.gain.before, links.gain.after, links.gain.unit)
     return (
-        f"Masses and inertias of its links are fitted: with those of the model file the error on held-out data is"
-        f" {before}, with fitted ones {after}{f'; most of that {told}' if first else ''}."
+        "The masses and inertias of the model file do not fit: with fitted ones the error on held-out data is"
+        f" {after} in place of {before}{f', mostly {told}' if first else ''}."
     )
 
 
