@@ -7,38 +7,28 @@ from __future__ import annotations
 
 import secrets
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import tasks
-from simulated_arm import RATE, Truth, arm, recording
+import wrong_links
+from wrong_links import Wrong
 
 import figaroh_jax as fj
 from figaroh_jax.diagnosis.diagnosis import diagnose
-from figaroh_jax.formats.assembly import welded_bodies
 from figaroh_jax.formats.config import Preprocess
-from figaroh_jax.formats.urdf import urdf_parts
-from figaroh_jax.recordings.dataset import Recording
+from figaroh_jax.formats.robotfile import read_robot, welded_to
 from figaroh_jax.reporting import answer, wording
 from figaroh_jax.results import Cause, Diagnosis, Links, Name
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 
 
-def diagnosed(truth: Truth, recordings: list[Recording]) -> Diagnosis:
-    model = fj.load_urdf(truth.file)
-    return diagnose(model, recordings, Preprocess(cutoff=10), welded=welded_bodies(model, urdf_parts(truth.file)[1]))
-
-
-def recordings(truth: Truth, seed: int) -> list[Recording]:
-    return [
-        recording(truth, 15.0, seed, name="first"),
-        recording(truth, 15.0, seed + 1, name="last", role="holdout"),
-    ]
+def diagnosed(wrong: Wrong) -> Diagnosis:
+    model = fj.load_urdf(wrong.file)
+    return diagnose(model, wrong.recordings, Preprocess(cutoff=10), welded=welded_to(model, wrong.file))
 
 
 def told(found: Diagnosis) -> Links:
@@ -51,18 +41,15 @@ def told(found: Diagnosis) -> Links:
 
 def test_a_hand_of_the_file_that_is_not_mounted_is_told_with_its_mass(tmp_path: Path) -> None:
     seed = secrets.randbits(31)
-    rng = np.random.default_rng(seed)
-    mass, (x, y, z) = rng.uniform(0.3, 0.8), rng.uniform(-0.05, 0.1, 3)
-    hand = f"""<link name="hand"><inertial><origin xyz="{x} {y} {z}"/><mass value="{mass}"/>
-      <inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>
-    <joint name="mount" type="fixed"><parent link="tool0"/><child link="hand"/></joint></robot>"""
-    truth = arm(tmp_path, 0.02, seed)  # without the hand
-    truth.file.write_text(tasks.URDF.replace("</robot>", hand))
-    found = diagnosed(truth, recordings(truth, seed))
+    wrong = wrong_links.hand(tmp_path, seed)
+    found = diagnosed(wrong)
     first = told(found).moved[0]
-    assert first.name == Name("link_inertia", ("rod",)), (seed, found.links)
-    assert first.note == f"as if hand ({mass:.3g} kg), which the file fixes to rod, were not there", (seed, first)
-    assert first.numbers["mass"].value == pytest.approx(-mass, abs=0.15 * mass), (seed, first)
+    assert first.name == wrong.told, (seed, found.links)
+    assert first.note == f"as if hand ({-wrong.size:.3g} kg), which the file fixes to rod, were not there", (
+        seed,
+        first,
+    )
+    assert first.numbers["mass"].value == pytest.approx(wrong.size, abs=0.15 * -wrong.size), (seed, first)
     assert first.note in wording.sentence(found, "bench")
     kept = answer.answer(found)["links"]
     assert (kept["moved"][0]["effect"], kept["moved"][0]["at"]) == ("link_inertia", ["rod"])
@@ -70,53 +57,39 @@ def test_a_hand_of_the_file_that_is_not_mounted_is_told_with_its_mass(tmp_path: 
 
 def test_the_link_whose_mass_lies_elsewhere_is_told_with_its_moments(tmp_path: Path) -> None:
     seed = secrets.randbits(31)
-    truth = arm(tmp_path, 0.02, seed)
-    way = np.random.default_rng(seed).choice([-1, 1], 2) * np.random.default_rng(seed + 1).uniform(0.05, 0.1, 2)
-    body = truth.model.inertias[2]  # the forearm
-    truth.model.inertias[2] = pin.Inertia(float(body.mass), body.lever + np.append(way, 0.0), body.inertia)
-    found = diagnosed(truth, recordings(truth, seed))
+    wrong = wrong_links.moved(tmp_path, seed)
+    found = diagnosed(wrong)
     first = told(found).moved[0]
-    assert first.name == Name("link_inertia", ("fore",)), (seed, found.links)
+    assert first.name == wrong.told, (seed, found.links)
     assert "no body" not in first.note
-    moved = truth.model.inertias[2].toDynamicParameters() - np.asarray(truth.nominal.inertia)[1]
-    for number, place in (("mx", 1), ("my", 2)):
-        value, std, unit = first.numbers[number]
-        assert unit == "kg m"
-        assert value == pytest.approx(moved[place], abs=max(4 * std, 0.05 * abs(moved[place]))), (seed, number, first)
+    value, std, unit = first.numbers["mx"]
+    assert unit == "kg m"
+    assert value == pytest.approx(wrong.size, abs=max(4 * std, 0.1 * abs(wrong.size))), (seed, first)
 
 
 def test_a_rotor_that_looks_like_its_link_is_told_as_one(tmp_path: Path) -> None:
     seed = secrets.randbits(31)
-    truth, size = arm(tmp_path, 0.005, seed), float(np.random.default_rng(seed).uniform(0.3, 0.8))
-    found = diagnosed(truth, [_turning(one, size) for one in recordings(truth, seed)])
-    shoulder = Name("rotor_inertia", ("shoulder",))
+    wrong = wrong_links.rotor(tmp_path, seed)
+    found = diagnosed(wrong)
     first = found.causes[0] if found.links is None else found.links.moved[0]  # the search itself may tell it
-    assert first.name == shoulder, (seed, found.causes, found.links)
-    numbers = first.parameters if isinstance(first, Cause) else first.numbers
-    assert numbers["inertia"].value == pytest.approx(size, abs=max(4 * numbers["inertia"].std, 0.1 * size)), seed
-
-
-def _turning(one: Recording, inertia: float) -> Recording:
-    """The recording of an arm whose shoulder turns a rotor besides."""
-    torque = np.array(one.torque)
-    torque[:, 0] += inertia * np.gradient(np.gradient(one.position[:, 0], 1 / RATE), 1 / RATE)
-    return replace(one, torque=torque)
+    assert first.name == wrong.told, (seed, found.causes, found.links)
+    value, std, _ = (first.parameters if isinstance(first, Cause) else first.numbers)["inertia"]
+    assert value == pytest.approx(wrong.size, abs=max(4 * std, 0.1 * wrong.size)), seed
 
 
 def test_one_gain_of_all_torques_is_told_or_told_to_be_alike(tmp_path: Path) -> None:
     seed = secrets.randbits(31)
-    truth, gain = arm(tmp_path, 0.02, seed), float(np.random.default_rng(seed).uniform(1.5, 2.0))
-    found = diagnosed(truth, [replace(one, torque=gain * np.array(one.torque)) for one in recordings(truth, seed)])
-    first, gained = told(found).moved[0], Name("torque_gain", ())  # a heavier forearm may do as well, if one can be so
-    assert first.name == gained or gained in first.instead, (seed, found.links)
-    if first.name == gained:
-        assert first.numbers["gain"].value == pytest.approx(gain, rel=0.1), (seed, first)
+    wrong = wrong_links.gain(tmp_path, seed)
+    found = diagnosed(wrong)
+    first = told(found).moved[0]  # a heavier forearm may do as well, if one can be so
+    assert wrong.told in (first.name, *first.instead), (seed, found.links)
+    if first.name == wrong.told:
+        assert first.numbers["gain"].value == pytest.approx(wrong.size, rel=0.1), (seed, first)
 
 
 def test_links_that_are_as_believed_are_not_told(tmp_path: Path) -> None:
     seed = secrets.randbits(31)
-    truth = arm(tmp_path, 0.05, seed)
-    found = diagnosed(truth, recordings(truth, seed))
+    found = diagnosed(wrong_links.right(tmp_path, seed))
     assert found.links is None, (seed, found.links)
     assert "links" not in answer.answer(found)
     assert wording.links(found) == []
@@ -149,3 +122,44 @@ def test_what_is_wrong_with_the_links_of_real_robots_files_is_told(name: str, da
         assert moved[0].numbers["mass"].value == pytest.approx(-0.73, abs=0.04)  # Franka's hand without its fingers
     if name == "tx40":
         assert moved[1].name == Name("rotor_inertia", ("joint_1",))
+
+
+HAND = """<link name="hand"><inertial><origin xyz="0.02 -0.01 0.05" rpy="0.3 0 0.2"/><mass value="0.7"/>
+    <inertia ixx="2e-3" iyy="1e-3" izz="1.5e-3" ixy="1e-4" ixz="0" iyz="0"/></inertial></link>
+  <link name="finger"><inertial><origin xyz="0 0 0.02"/><mass value="0.1"/>
+    <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="mount" type="fixed"><parent link="tool0"/><child link="hand"/>
+    <origin xyz="0 0 0.1" rpy="0 0.4 0"/></joint>
+  <joint name="grip" type="fixed"><parent link="hand"/><child link="finger"/>
+    <origin xyz="0.03 0 0.1"/></joint></robot>"""
+MJCF = """<mujoco><worldbody><body name="upper"><joint name="shoulder" axis="0 1 0"/>
+  <inertial pos="0 0 0.2" mass="3" diaginertia="0.04 0.04 0.01"/>
+  <body name="fore" pos="0 0 0.4" euler="20 0 0"><joint name="elbow" axis="1 0 0" pos="0 0.01 0"/>
+    <inertial pos="0 0 0.15" mass="2" diaginertia="0.02 0.02 0.005"/>{hand}</body></body></worldbody></mujoco>"""
+HELD = """<body name="hand" pos="0 0 0.3" euler="0 30 0">
+  <inertial pos="0.02 0 0.05" mass="0.7" diaginertia="2e-3 1e-3 2e-3"/>
+  <body name="finger" pos="0.03 0 0.1">
+    <inertial pos="0 0 0.02" mass="0.1" diaginertia="1e-4 1e-4 1e-4"/></body></body>"""
+
+
+@pytest.mark.parametrize("form", ["urdf", "mjcf"])
+def test_what_a_file_fixes_to_a_link_is_what_the_link_has_more_with_it(form: str, tmp_path: Path) -> None:
+    files, texts = [tmp_path / f"{name}.{'urdf' if form == 'urdf' else 'xml'}" for name in ("with", "without")], []
+    if form == "urdf":
+        texts = [tasks.URDF.replace("</robot>", HAND), tasks.URDF]
+    else:
+        pytest.importorskip("mujoco")
+        texts = [MJCF.format(hand=HELD), MJCF.format(hand="")]
+    for file, text in zip(files, texts, strict=True):
+        file.write_text(text)
+    robots = [read_robot(file) for file in files]
+    there, gone = (welded_to(robot, file) for robot, file in zip(robots, files, strict=True))
+    assert gone == ()
+    assert [(one.name, robots[0].link_names[one.at]) for one in there] == [
+        (name, "rod" if form == "urdf" else "fore") for name in ("hand", "finger")
+    ]
+    whole, finger = there
+    more = np.asarray(robots[0].inertia) - np.asarray(robots[1].inertia)
+    np.testing.assert_allclose(whole.inertia, more[whole.at], rtol=0, atol=1e-14)
+    assert not np.delete(more, whole.at, 0).any()
+    assert (whole.inertia[0], finger.inertia[0]) == pytest.approx((0.8, 0.1))

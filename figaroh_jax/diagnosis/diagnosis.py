@@ -91,7 +91,7 @@ def diagnose_task(
         "trust": task.robot.trust,
         "forbid": task.diagnose.forbid,
         "alpha": task.diagnose.alpha,
-        "welded": welded_to(model, task),
+        "welded": welded_to(model, task.robot.model, task.robot.root),
     }
     options["tolerance"] = task.diagnose.tolerance.torque
     robot = make_backend(backend, model)

@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..effects.base import joint_unit
 from ..effects.catalogue import find
 from ..effects.inertia import LinkInertia
 from ..effects.transmission import RotorInertia
@@ -21,6 +22,7 @@ from ..estimation.rows import UNKNOWN, Prior
 from ..estimation.told import ABOUT_JOINT, TOLD, inertia_about_joint, possible, sizes, told_numbers
 from ..formats.assembly import Welded
 from ..results import Estimate, Gain, Links, MovedLink, Name
+from ..rigid.model import prismatic
 from .comparison import FoldSums, coefficients, left_out, told
 from .holdout import relative_error, residual_rms
 from .problem import Problem
@@ -39,8 +41,8 @@ def moved_links(
 ) -> Links | None:
     """What the links of the model file leave beside those of the baseline `first`, and which links move in `last`.
 
-    None where they stay within what is believed of them, all that is left being taken for noise. `welded` are bodies
-    that the file fixes to a link.
+    None where they stay within what is believed of them, all that is left being taken for noise, or predict what was
+    not fitted as well as those of the baseline. `welded` are bodies that the file fixes to a link.
     """
     if problem.bounded:
         return None  # they are held there, and `link_inertia` is a cause
@@ -49,6 +51,8 @@ def moved_links(
         return None
     filed = _as_filed(problem, first)
     gain = Gain(relative_error(problem, filed), relative_error(problem, first))
+    if not gain.after < gain.before:
+        return None
     return Links(residual_rms(problem, filed.state), gain, about.far, problem.trust, tuple(_which(about)))
 
 
@@ -190,9 +194,10 @@ class _About:
 
 
 def _without_rotor(problem: Problem, step: Step) -> list[int]:
-    """Joints whose drive has no rotor in the state."""
+    """Columns of joints that turn or slide and whose drive has no rotor in the state."""
     with_one = {int(j) for term in step.state.terms if term.name == RotorInertia.name for j in np.ravel(term.at)}
-    return [j for j in range(problem.model.nv) if j not in with_one]
+    driven = {joint.coordinate for joint in problem.model.joints if joint.kind in ("revolute", "prismatic")}
+    return sorted(driven - with_one)
 
 
 def _left(sums: FoldSums, folds: Float[np.ndarray, "folds P"]) -> float:
@@ -265,9 +270,10 @@ def _told(about: _About, found: _Fit, chosen: dict[_One, tuple[float, tuple[_One
             note = note if bodies else _NO_BODY
         else:
             value, std = values[about.column(one)]
-            told, note = {"inertia": Estimate(value, std, "kg m2")}, ""
+            straight = one.kind == "rotor" and prismatic(about.robot)[one.at]
+            told, note = {"inertia": Estimate(value, std, joint_unit("kg m2", straight))}, ""
             if one.kind == "size":
-                told = {"gain": Estimate(1 + value, std, "1")}
+                told = {"gain": Estimate(1 + value, std, "")}
                 note = "the measured torque is so many times what all links of the file ask for"
             elif one.kind == "welded":
                 body = about.welded[one.at]

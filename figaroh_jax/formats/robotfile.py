@@ -139,9 +139,9 @@ def load_robot(task: Task) -> RobotModel:
     return read_robot(task.robot.model, **robot_options(task.robot))
 
 
-def welded_to(robot: RobotModel, task: Task) -> tuple[Welded, ...]:
-    """What the model file of a task fixes to the moving links of its robot: hands, cameras, covers."""
-    file, root, form = find_in_packages(task.robot.model, ()), task.robot.root, model_format(task.robot.model)
+def welded_to(robot: RobotModel, path: str | Path, root: Root | None = None) -> tuple[Welded, ...]:
+    """What the file of a robot fixes to its moving links: hands, cameras, covers. Arguments as in `read_robot`."""
+    file, form = find_in_packages(path, ()), model_format(path)
     if form == "urdf":
         return welded_bodies(robot, urdf_parts(file)[1])
     return welded_bodies(robot, usd_parts(file, root) if form == "usd" else mjcf_parts(compile_mjcf(file), root)[:2])
