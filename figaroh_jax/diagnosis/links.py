@@ -30,7 +30,7 @@ from .state import solved, with_term
 from .step import Step, stand
 from .thresholds import AS_IF_GONE, BEYOND_TRUST, GAIN_OF_A_LINK, MOST_MOVED, MOST_OF_A_GAIN, SURELY
 
-__all__ = ["moved_links"]
+__all__ = ["gain_does", "moved_links"]
 
 _HELD = 1e12  # times the stated precision of the links: they stay as the file has them
 _NO_BODY = "no body has these numbers beside the rest of the link: they stand for something else as well"
@@ -54,6 +54,18 @@ def moved_links(
     if not gain.after < gain.before:
         return None
     return Links(residual_rms(problem, filed.state), gain, about.far, problem.trust, tuple(_which(about)))
+
+
+def gain_does(problem: Problem, bare: Step, full: Step, whitening: Float[np.ndarray, "F nv"]) -> bool:
+    """Whether one gain of all torques, beside the links of the file, does what a body in `full` and not in `bare` does.
+
+    A body is free where links are held near the file: torque that is read too large asks for one.
+    """
+    about = _About(problem, bare, whitening)
+    sums, prior = (FoldSums(*(x / about.level for x in full.folded))), full.state.prior
+    filed, size = about.left([]).squares, about.left([_One("size", 0)])
+    taken = filed - _left(sums, left_out(sums, prior))
+    return size.surely() and filed - size.squares > (1 - GAIN_OF_A_LINK) * taken
 
 
 def _as_filed(problem: Problem, step: Step) -> Step:
@@ -211,8 +223,8 @@ def _which(about: _About) -> list[MovedLink]:
 
     Ten numbers of a link follow much. One of a body that the file fixes to it, or of one or two rotors, counts before
     them where it takes most of what they do, and a link that a body can have before one that none has. One size of all
-    links counts only where it does all that they do and no body has what one of them would: it makes up for some of
-    whatever is too heavy.
+    links counts only where it does all that they do, and more than the best of them or what no body has: it makes up for
+    some of whatever is too heavy.
     """
     now = about.left([])
     begun, whole, few = now.squares, now.squares - about.free, GAIN_OF_A_LINK * (now.squares - about.free)
@@ -224,7 +236,8 @@ def _which(about: _About) -> list[MovedLink]:
         if not ends or now.squares - ends[0].squares < few:
             break
         best = _simplest(about, now, ends, few)
-        if not now.ones and size.surely() and size.squares < about.free + few and not about.bodies(best):
+        does_all = not now.ones and size.surely() and size.squares < about.free + few
+        if does_all and (size.squares < best.squares or not about.bodies(best)):
             return _told(about, size, {size.ones[0]: (min((begun - size.squares) / whole, 1.0), ())})
         others = [*ends, size] if not now.ones and size.surely() else ends
         alike = [e.ones[-1] for e in others if e.ones[-1] not in best.ones and e.squares - best.squares < few]
