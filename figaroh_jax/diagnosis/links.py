@@ -223,8 +223,8 @@ def _which(about: _About) -> list[MovedLink]:
 
     Ten numbers of a link follow much. One of a body that the file fixes to it, or of one or two rotors, counts before
     them where it takes most of what they do, and a link that a body can have before one that none has. One size of all
-    links counts only where it does all that they do, and more than the best of them or what no body has: it makes up for
-    some of whatever is too heavy.
+    links counts only where it does all that they do, and more than the best of them or what no body has: it makes up
+    for some of whatever is too heavy.
     """
     now = about.left([])
     begun, whole, few = now.squares, now.squares - about.free, GAIN_OF_A_LINK * (now.squares - about.free)
