@@ -80,9 +80,9 @@ def links(diagnosis: Diagnosis) -> list[str]:
         return []
     before, after = fall(own.gain.before, own.gain.after, own.gain.unit)
     return [
-        f"Links of the model file: with them the error on held-out data is {before}, with fitted ones {after}. The"
-        f" torque moves them {number(own.far, 2)} times as far as robot.trust ({number(100 * own.trust, 3)} %) lets"
-        " expect; a wrong gain of the torque at a joint does that too.",
+        f"With the links of the model file the error on held-out data is {before}, with fitted ones {after}. The torque"
+        f" moves them {number(own.far, 2)} times as far as robot.trust ({number(100 * own.trust, 3)} %) lets expect; a"
+        " wrong gain of the torque at a joint does that too.",
         *map(moved, own.moved),
     ]
 
@@ -93,7 +93,7 @@ def moved(one: MovedLink) -> str:
     sizes = ", ".join(f"{name} {interval(value)}" for name, value in one.numbers.items())
     instead = f"{_join([phrase(other) for other in one.instead], 'or')} does as well" if one.instead else ""
     share = f"with it {100 * one.share:.0f} % of the difference"
-    return f"{phrase(one.name)}: {'; '.join(filter(None, (sizes, one.note, instead, share)))}"
+    return f"{phrase(one.name)}: {'; '.join(filter(None, (sizes, one.note, share, instead)))}"
 
 
 def _verdict(diagnosis: Diagnosis, robot: str) -> str:
