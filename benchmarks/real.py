@@ -119,12 +119,25 @@ def _lines(name: str, told: dict[str, Any]) -> list[str]:
         size = f"{gain['holdout_before']:.4g} -> {gain['holdout_after']:.4g}"
         others = ", ".join(f"{o['effect']} ({', '.join(o['at'])})" for o in cause.get("ambiguous_with", ()))
         lines.append(f"   {cause['effect']} ({', '.join(cause['at'])}): {size}" + (f"; or {others}" if others else ""))
+    if own := answer.get("links"):
+        gain = own["gain"]
+        size = f"{gain['holdout_before']:.4g} with those of the file, {gain['holdout_after']:.4g} with fitted ones"
+        lines.append(f"   links: {size}, {own['sigmas']:.1f} sigma")
+        lines += [f"      {_moved(one)}" for one in own["moved"]]
     rest = answer.get("rest", {})
     if "relative" in rest:
         lines.append("   rest " + " ".join(f"{x:.3f}" for x in rest["relative"]) + " of each joint's torque")
         parts = sorted(rest.get("parts", ()), key=lambda p: -p["share"])[:PARTS]
         lines += [f"   rest goes with {p['kind']} at {', '.join(p['at'])} ({p['share']:.0%})" for p in parts]
     return [*lines, *identified]
+
+
+def _moved(one: dict[str, Any]) -> str:
+    """A link or rotor that is another than the file has, as `answer.json` tells it."""
+    sizes = ", ".join(f"{n} {p['value']:.3g} +- {1.96 * p['std']:.2g}" for n, p in one["parameters"].items())
+    instead = "".join(f" or {o['effect']} ({', '.join(o['at'])})" for o in one["instead"])
+    note = f" ({one['note']})" if one["note"] else ""
+    return f"{one['effect']} ({', '.join(one['at'])}){instead}: {sizes}{note}, {one['share']:.0%} with it"
 
 
 def _pooled(result: dict[str, Any]) -> str:
