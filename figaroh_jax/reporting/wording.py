@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..effects.catalogue import CATALOGUE
+from ..estimation.told import ABOUT_JOINT
 from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, MovedLink, Name, Nearest, Part
 from .rollout_effects import ROLLOUT_EFFECTS
 
@@ -65,11 +66,13 @@ def _filed(diagnosis: Diagnosis) -> str:
         return ""
     first = links.moved[: next((k for k, one in enumerate(links.moved, 1) if one.share > _MOST), len(links.moved))]
     gone = [one.note for one in first if one.note.startswith("as if ")]
-    told = gone[0] if gone else f"by what looks like {_join([phrase(one.name) for one in first], 'and')}"
+    looks = _join([phrase(one.name) for one in first], "and")
+    plain = any(one.name.effect == "link_inertia" and one.note != ABOUT_JOINT for one in first)
+    told = gone[0] if gone else "" if plain else f"by what looks like {looks}"  # plain links stand for much else
     before, after = fall(links.gain.before, links.gain.after, links.gain.unit)
     return (
         "The masses and inertias of the model file do not fit: with fitted ones the error on held-out data is"
-        f" {after} in place of {before}{f', mostly {told}' if first else ''}."
+        f" {after} in place of {before}{f', mostly {told}' if told else ''}."
     )
 
 
@@ -82,7 +85,7 @@ def links(diagnosis: Diagnosis) -> list[str]:
     return [
         f"With the links of the model file the error on held-out data is {before}, with fitted ones {after}. The torque"
         f" moves them {number(own.far, 2)} times as far as robot.trust ({number(100 * own.trust, 3)} %) lets expect; a"
-        " wrong gain of the torque at a joint does that too.",
+        " wrong gain of the torque at a joint does that too, and so may what else is missing.",
         *map(moved, own.moved),
     ]
 
