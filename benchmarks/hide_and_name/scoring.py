@@ -23,7 +23,7 @@ def score(cases: dict[str, Case], out: Path, modes: Iterable[str]) -> str:
         own = [r for r in rows if r["study"] == title]
         if own:
             lines += ["", f"{title} ({what} is right):", *_table(own, HIDDEN if title == "hidden" else NONE)]
-            lines += _extra(own, title)
+            lines += [*_extra(own, title), *_moved(own)]
     return "\n".join([*lines, "", *map(_told, rows)])
 
 
@@ -45,6 +45,7 @@ def _rows(case: Case, out: Path, modes: Iterable[str]) -> list[dict[str, Any]]:
             | {"new": graded.new, "false": graded.false, "size_errors": graded.sizes, "inside": graded.inside}
             | {key: case.get(key) for key in ("left", "sigmas", "misfit", "visible")}
             | {"p_value": answer["p_value"] if answer else None, "cpu_s": ran["cpu_s"]}
+            | {"links": bool(answer) and "links" in answer}
         )
     return found
 
@@ -73,6 +74,12 @@ def _extra(rows: list[dict[str, Any]], title: str) -> list[str]:
         return _by_sight(rows)
     p = [r["p_value"] for r in rows if r["p_value"] is not None]
     return [f"p < .05 in {sum(x < 0.05 for x in p)} of {len(p)}"] if p else []
+
+
+def _moved(rows: list[dict[str, Any]]) -> list[str]:
+    """How often links other than those of the file are told, though these are within what is believed."""
+    count = sum(r["links"] for r in rows)
+    return [f"links are told to be others than the file's in {count} of {len(rows)}"] if count else []
 
 
 def _by_sight(rows: list[dict[str, Any]]) -> list[str]:

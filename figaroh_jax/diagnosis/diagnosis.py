@@ -44,7 +44,7 @@ from .holdout import kept_out_error, residual_rms, traces
 from .joint import Joint, least_sure, opened, polished, sized, with_rest, without_a_number
 from .judgement import KeptOut, Left, Searched, as_slow_noise, doubted_rest, reasons_against, standings_of, sticks_alone
 from .layout import describe_folds, repeats_not_said
-from .links import gain_does, moved_links
+from .links import as_gain, moved_links
 from .naming import LIKE_A_REST, ONE_PART, beyond_simpler, lone_part, strong
 from .reading import Reader, only_read
 from .rest import (
@@ -474,7 +474,7 @@ def _answered(
             why = "none of its ten numbers is surely there"
         elif searched.strict and (least := lone_part(gaining.joint)) is not None:
             why = ONE_PART
-        elif (least := _as_gain(here, named, gaining.joint)) is not None:
+        elif (least := as_gain(here, gaining.joint)) is not None:
             why = "one gain of all torques, beside the links of the model file, explains as much"
         elif (least := _as_links(named, gaining.joint)) is not None:
             why = (
@@ -485,18 +485,6 @@ def _answered(
         against[named[least].name] = why
         named = [f for f in named if f is not named[least]]
         joint = together(here, named)
-
-
-def _as_gain(here: Setting, named: Sequence[Found], joint: Joint) -> int | None:
-    """The first body among the causes that one gain of all torques does as well as, where links are not well known."""
-    problem = here.problem
-    for k, one in enumerate(named if not problem.bounded else ()):
-        if one.effect.body:
-            others = [e for at, e in enumerate(joint.causes) if at != k]
-            bare = with_causes(problem, here.start, others, here.whitening)
-            if gain_does(problem, bare, joint.step, here.whitening):
-                return k
-    return None
 
 
 def _as_links(named: Sequence[Found], joint: Joint) -> int | None:

@@ -25,12 +25,14 @@ from ..results import Estimate, Gain, Links, MovedLink, Name
 from ..rigid.model import prismatic
 from .comparison import FoldSums, coefficients, left_out, told
 from .holdout import relative_error, residual_rms
+from .joint import Joint
 from .problem import Problem
+from .setting import Setting
 from .state import solved, with_term
-from .step import Step, stand
+from .step import Step, stand, with_causes
 from .thresholds import AS_IF_GONE, BEYOND_TRUST, GAIN_OF_A_LINK, MOST_MOVED, MOST_OF_A_GAIN, SURELY
 
-__all__ = ["gain_does", "moved_links"]
+__all__ = ["as_gain", "moved_links"]
 
 _HELD = 1e12  # times the stated precision of the links: they stay as the file has them
 _NO_BODY = "no body has these numbers beside the rest of the link: they stand for something else as well"
@@ -56,13 +58,24 @@ def moved_links(
     return Links(residual_rms(problem, filed.state), gain, about.far, problem.trust, tuple(_which(about)))
 
 
-def gain_does(problem: Problem, bare: Step, full: Step, whitening: Float[np.ndarray, "F nv"]) -> bool:
-    """Whether one gain of all torques, beside the links of the file, does what a body in `full` and not in `bare` does.
+def as_gain(here: Setting, joint: Joint) -> int | None:
+    """The first body among the causes that one gain of all torques does as well as, where links are not well known.
 
     A body is free where links are held near the file: torque that is read too large asks for one.
     """
+    problem, start, whitening = here.problem, here.start, here.whitening
+    for k, effect in enumerate(joint.causes if not problem.bounded else ()):
+        if effect.body:
+            others = [other for other in joint.causes if other is not effect]
+            if _gain_does(problem, with_causes(problem, start, others, whitening), joint.step, whitening):
+                return k
+    return None
+
+
+def _gain_does(problem: Problem, bare: Step, full: Step, whitening: Float[np.ndarray, "F nv"]) -> bool:
+    """Whether one gain of all torques, beside the links of the file, does what `full` has more than `bare`."""
     about = _About(problem, bare, whitening)
-    sums, prior = (FoldSums(*(x / about.level for x in full.folded))), full.state.prior
+    sums, prior = FoldSums(*(x / about.level for x in full.folded)), full.state.prior
     filed, size = about.left([]).squares, about.left([_One("size", 0)])
     taken = filed - _left(sums, left_out(sums, prior))
     return size.surely() and filed - size.squares > (1 - GAIN_OF_A_LINK) * taken
