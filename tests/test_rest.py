@@ -15,10 +15,12 @@ from figaroh_jax.diagnosis.flexible import Smooth
 from figaroh_jax.diagnosis.joint import Joint, has_size, least_sure
 from figaroh_jax.diagnosis.naming import (
     Standing,
+    _one_part,
     _spoils,
     _turns_against_itself,
     behind_joints,
     beside_rest,
+    elsewhere_too,
     lone_part,
     of_its_own,
     reason_against,
@@ -280,6 +282,55 @@ RIGHT = Standing(
 def test_beside_a_rest_a_cause_is_named_by_what_it_alone_explains(changes: dict[str, float], word: str) -> None:
     reason = reason_against(replace(RIGHT, **changes), True, 0.01)
     assert word in reason and bool(word) == bool(reason)
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"gain": 0.1}, ""),
+        ({"gain": 0.2, "t": 2.5, "modulation": 0.14}, ""),  # borderline
+        ({"gain": 0.1, "t": 2.0}, "not significant"),
+        ({"gain": 0.1, "physical": False}, "physically impossible"),
+        ({"gain": 0.1, "modulation": 0.2}, "varies"),
+        ({"gain": -0.1}, "does not improve"),
+        ({"gain": 0.1, "share": 0.015}, "needed"),
+    ],
+)
+def test_what_most_drives_have_need_not_take_much_at_one_more_joint(changes: dict[str, float], word: str) -> None:
+    reason = reason_against(replace(RIGHT, **changes), True, 0.01, elsewhere=True)
+    assert word in reason and bool(word) == bool(reason)
+
+
+@pytest.mark.parametrize(
+    ("effect", "named", "joints", "asked"),
+    [
+        ("rotor_inertia", 5, 6, True),
+        ("rotor_inertia", 3, 6, True),
+        ("rotor_inertia", 2, 4, False),  # of three other joints
+        ("rotor_inertia", 3, 8, False),  # of seven
+        ("joint_spring", 5, 6, False),  # no part of a drive
+    ],
+)
+def test_a_part_of_every_drive_is_one_that_most_other_joints_have(
+    effect: str, named: int, joints: int, asked: bool
+) -> None:
+    names = [Name(effect, (f"joint_{k}",)) for k in range(named + 1)]
+    found = cast(Any, [SimpleNamespace(name=one, effect=find(effect)(np.array([k]))) for k, one in enumerate(names)])
+    against = dict.fromkeys(names, "") | {names[-1]: "it removes 20 % of the held-out error where it acts"}
+    assert (names[-1] in elsewhere_too(found, against, joints)) == asked
+    against[names[0]] = "its fitted sign is physically impossible"  # one that is not named does not count
+    assert (names[-1] in elsewhere_too(found, against, joints)) == (asked and named - 1 >= max(3, joints // 2))
+
+
+@pytest.mark.parametrize(
+    ("damping", "friction", "one"),
+    [(1.1, -2.7, True), (1.1, 2.7, False), (-2.5, 1.0, True), (2.1, -2.7, False)],  # in standard deviations
+)
+def test_a_part_of_a_coupling_that_no_rotor_has_does_not_count(damping: float, friction: float, one: bool) -> None:
+    """A coupling of -.20 N m of friction was told for a rotor of the TX40 that was left out of the catalogue."""
+    values = {"inertia": 15.7, "damping": damping, "friction": friction, "sign": -1.0}
+    effect = find("coupled_transmission")(np.array([1, 2]), **{k: np.float64(x) for k, x in values.items()})
+    assert _one_part(effect, Fitted(np.zeros(3), np.eye(3), ()), (0, 1, 2)) == one
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from .naming import (
     Standing,
     behind_joints,
     beside_rest,
+    elsewhere_too,
     of_its_own,
     reason_against,
     standings,
@@ -144,8 +145,11 @@ def reasons_against(
         rough = roughly_predictable(here.problem, joint.step, here.whitening, tolerance, moving, at)
         rests = [rest or bool(rough[own].any()) for rest, own in zip(rests, places, strict=True)]
     asked = (tolerance, kept_out.certain, searched.fading)
-    against = {one.name: reason_against(one, rest, *asked) for one, rest in zip(each, rests, strict=True)}
-    return against | behind_joints([one for one, rest in zip(each, rests, strict=True) if rest], against)
+    pairs = list(zip(each, rests, strict=True))
+    against = {one.name: reason_against(one, rest, *asked) for one, rest in pairs}
+    alike = elsewhere_too(found, against, here.problem.model.nv)
+    against |= {one.name: reason_against(one, rest, *asked, elsewhere=True) for one, rest in pairs if one.name in alike}
+    return against | behind_joints([one for one, rest in pairs if rest], against)
 
 
 def as_slow_noise(

@@ -38,6 +38,7 @@ from .thresholds import (
     BESIDE_SMOOTH,
     BUYS,
     COUPLED,
+    FEWEST_ALIKE,
     GAIN_NAMED,
     GAIN_NAMED_ROBOT,
     LAW_LEAVES,
@@ -63,6 +64,7 @@ __all__ = [
     "beside_rest",
     "beyond_simpler",
     "cause_torque",
+    "elsewhere_too",
     "lone_part",
     "of_its_own",
     "reason_against",
@@ -121,17 +123,20 @@ def reason_against(
     tolerance: float,
     certain: Callable[[Name], bool] = lambda name: False,
     fading: Collection[Name] = (),
+    *,
+    elsewhere: bool = False,
 ) -> str:
     """Why the cause is not named, in words with the number that failed; empty where it is.
 
     Beside a `rest` it must explain much of its joints' error, and surely; without one it must only be there, with one
     amplitude: one that would rather vary predicts better on data that were not fitted, whether or not a rest shows.
     `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not or where it is
-    borderline; `fading` are those that were surely there and are gone in recordings kept out.
+    borderline; `fading` are those that were surely there and are gone in recordings kept out. A part that every drive
+    has, and that is named at most joints `elsewhere`, need not take much of what a joint leaves (`elsewhere_too`).
     """
     checks = _of_all(one, tolerance)
     if rest or not (one.beside_rest or one.complete):  # what any rest looks like is taken on less only if it is all
-        checks = chain(checks, _of_those_beside_rest(one, rest, certain, fading))
+        checks = chain(checks, _of_those_beside_rest(one, rest, certain, fading, elsewhere))
     return next((reason for passed, reason in checks if not passed), "")
 
 
@@ -165,7 +170,7 @@ def _of_all(one: Standing, tolerance: float) -> Iterator[tuple[bool, str]]:
 
 
 def _of_those_beside_rest(
-    one: Standing, rest: bool, certain: Callable[[Name], bool], fading: Collection[Name]
+    one: Standing, rest: bool, certain: Callable[[Name], bool], fading: Collection[Name], elsewhere: bool
 ) -> Iterator[tuple[bool, str]]:
     """What a cause beside a rest is asked more. `certain` costs a fit: it is asked where the answer hangs on it."""
     least, most = (GAIN_NAMED_ROBOT, MODULATION_ROBOT) if one.whole else (GAIN_NAMED, MODULATION)
@@ -176,7 +181,7 @@ def _of_those_beside_rest(
         f"its gain on held-out data is not significant: t = {one.t:.1f}, {one.t_needed:.1f} needed",
     )
     yield (
-        one.gain >= least,
+        one.gain >= least or elsewhere,
         f"it removes {100 * one.gain:.0f} % of the held-out error where it acts, {100 * least:.0f} % needed",
     )
     yield (
@@ -198,10 +203,24 @@ def _of_those_beside_rest(
         " stand for is neither",
     )
     yield (
-        margin >= MARGIN or certain(one.name),
+        margin >= MARGIN or elsewhere or certain(one.name),
         f"it is borderline: t, gain and a steady amplitude together are {margin:.1f} times what each alone"
         f" needs, {MARGIN:.0f} needed",
     )
+
+
+def elsewhere_too(found: Sequence[Found], against: Mapping[Name, str], joints: int) -> set[Name]:
+    """Causes that are a part which every drive has (`Effect.in_every_drive`), named at most of the other joints.
+
+    A robot file that has no rotor at five joints of six has none at the sixth. What speaks against a name where such a
+    part takes little of what its joint leaves, that it may stand in for something else, is then the less likely.
+    """
+    out = set[Name]()
+    for one in found:
+        alike = [f for f in found if f.effect.name == one.effect.name and f is not one and not against[f.name]]
+        if one.effect.in_every_drive and len(alike) >= max(FEWEST_ALIKE, joints // 2):
+            out.add(one.name)
+    return out
 
 
 def behind_joints(each: Sequence[Standing], against: Mapping[Name, str]) -> dict[Name, str]:
@@ -559,13 +578,13 @@ def _with_smooth(grown: _Grown, step: Step) -> Hypothesis:
 
 
 def _one_part(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:
-    """Whether no more than one of a coupling's parts is surely there (two standard deviations).
+    """Whether no more than one of a coupling's parts is surely there (two standard deviations above zero).
 
     A rotor that turns with two joints has inertia and friction. Inertia alone is that of a link or of a rotor at one of
     them; damping alone is what a late torque looks like.
     """
     deviations = _deviations(effect, fitted, place)
-    return sum(abs(deviations[n]) >= COUPLED for n in effect.one_rotor) < 2
+    return sum(deviations[n] >= COUPLED for n in effect.one_rotor) < 2
 
 
 def lone_part(joint: Joint) -> int | None:

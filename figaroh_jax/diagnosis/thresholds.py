@@ -68,6 +68,7 @@ ALL_BUT = 0.1  # of the squares that a cause removes: what smooth functions may 
 # what an amplitude that varies may surely gain
 STANDS_OUT = 2.0  # times what most other joints have: squares at a cause's joints that count as a trace of its own
 MARGIN = 4.0  # times what is needed, of t, gain and modulation together (each of them as much at the most)
+FEWEST_ALIKE = 3  # other joints that have a part which every drive has: from here a joint's own need not take much
 SHARE_NAMED = 0.02  # RMS torque of the cause over that of the joint
 WEIGHTLESS = 2.0  # standard deviations below zero of what a link weighs with its cause: above, the cause is none
 TURNED_DOWN = 0.05  # of its largest: what friction that a law bends may have lost at the joint's top speed

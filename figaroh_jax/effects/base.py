@@ -314,6 +314,7 @@ class Effect(eqx.Module):
     one_rotor: ClassVar[
         tuple[str, ...]
     ] = ()  # of a rotor that turns two joints: inertia, then what tells it from links
+    in_every_drive: ClassVar[bool] = False  # whether a robot whose file lacks it at most joints lacks it at all of them
     like_links: ClassVar[bool] = False  # whether its torque is much of what links other than believed would add
     needs_trust: ClassVar[float] = np.inf  # trust in the inertials (relative) above which it is no cause
     separated_by: ClassVar[str] = ""  # the experiment that tells it from what looks alike; {at} stands for the place

@@ -34,7 +34,7 @@ class RotorInertia(JointEffect):
     """Inertia of the motor and gears, seen through the gear ratio (armature)."""
 
     name, title = "rotor_inertia", "rotor inertia"
-    like_links = True
+    in_every_drive = like_links = True
     reverses = False
     equation = "inertia a"
     separated_by = "fast motion of {at} in several postures of the joints beyond it"
