@@ -1,11 +1,11 @@
 """Model files with wrong links: whether `diagnose` tells what is wrong with them, over fresh seeds.
 
-    python benchmarks/wrong_links.py --seeds 1 2 3 [--kinds hand moved rotor gain right]
+    python benchmarks/wrong_links.py --seeds 1 2 3 [--kinds hand moved rotor rotors load gain right]
 
 Each is a bench arm of `tests/wrong_links.py`, whose recordings Pinocchio makes: a hand that is not mounted, a forearm
-whose mass lies elsewhere, a rotor, one gain of all torques, or links that are as believed. One line a run: `right` is
-told first (a rotor also where the search names it), `alike` among what does as well; a name is `wrong` where a cause is
-named that is not there.
+whose mass lies elsewhere, a rotor, rotors at every joint, these with a load, one gain of all torques, or links that are
+as believed. One line a run: `right` is told first (also where the search names it), `alike` among what does as well,
+`beside` something else that is there; a name is `wrong` where a cause is named that is not there.
 """
 
 from __future__ import annotations
@@ -33,17 +33,18 @@ def run(kind: str, seed: int) -> str:
     named = {cause.name for cause in found.causes}
     numbers = {} if first is None else first.numbers
     if wrong.told in named:
-        word, numbers = "right", found.causes[0].parameters
+        word = "right"
+        numbers = next(cause.parameters for cause in found.causes if cause.name == wrong.told)
     elif first is None:
         word = "right" if wrong.told is None else "silent"
     elif first.name == wrong.told:
         word = "right"
     else:
-        word = "alike" if wrong.told in first.instead else "other"
+        word = "alike" if wrong.told in first.instead else "beside" if first.name in wrong.beside else "other"
     size = f", {wrong.number} {numbers[wrong.number].value:.3g} for {wrong.size:.3g}" if wrong.number in numbers else ""
     note = f" ({first.note})" if first is not None and first.note else ""
     names = "+".join(map(str, sorted(named))) or "-"
-    false = " wrong name" if named - {wrong.told} else ""
+    false = " wrong name" if named - {wrong.told, *wrong.beside} else ""
     return f"{word}{size}; told {first and first.name}{note}; {found.verdict} {names}{false}"
 
 

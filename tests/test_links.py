@@ -77,6 +77,43 @@ def test_a_rotor_that_looks_like_its_link_is_told_as_one(tmp_path: Path) -> None
     assert value == pytest.approx(wrong.size, abs=max(4 * std, 0.1 * wrong.size)), seed
 
 
+def sure(wrong: Wrong, found: Diagnosis, seed: int) -> set[Name]:
+    """What is named: nothing but what is there, each of the right size."""
+    assert wrong.told is not None
+    names = {cause.name for cause in found.causes}
+    assert names <= {wrong.told, *wrong.beside}, (seed, found.causes)
+    for cause in found.causes:
+        if cause.name == wrong.told:
+            value, std, _ = cause.parameters[wrong.number]
+            assert value == pytest.approx(wrong.size, abs=max(4 * std, 0.1 * wrong.size)), (seed, cause)
+    return names
+
+
+@pytest.mark.parametrize("seed", [5, 8, 9])  # a body was found in their place
+def test_rotors_of_all_drives_are_named_and_no_body_that_holds_them(seed: int, tmp_path: Path) -> None:
+    wrong = wrong_links.rotors(tmp_path, seed)
+    found = diagnosed(wrong)
+    assert sure(wrong, found, seed) == {wrong.told, *wrong.beside}
+    assert found.links is None
+
+
+def test_nothing_but_rotors_is_told_of_a_file_that_lacks_them(tmp_path: Path) -> None:
+    seed = secrets.randbits(31)
+    wrong = wrong_links.rotors(tmp_path, seed)
+    found = diagnosed(wrong)
+    named = sure(wrong, found, seed)
+    assert wrong.told in named or told(found).moved[0].name in (wrong.told, *wrong.beside), (seed, found.links)
+
+
+@pytest.mark.parametrize("seed", [12, 13, 15, None])
+def test_a_load_is_no_rotor(seed: int | None, tmp_path: Path) -> None:
+    """Without it the links would carry it, as well on what was left out, and far from where they are believed."""
+    fixed, seed = seed is not None, secrets.randbits(31) if seed is None else seed
+    wrong = wrong_links.load(tmp_path, seed)
+    named = sure(wrong, diagnosed(wrong), seed)
+    assert not fixed or wrong.told in named
+
+
 def test_one_gain_of_all_torques_is_told_or_told_to_be_alike(tmp_path: Path) -> None:
     seed = secrets.randbits(31)
     wrong = wrong_links.gain(tmp_path, seed)

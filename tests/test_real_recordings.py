@@ -202,3 +202,28 @@ def test_a_coupling_of_inertia_alone_is_no_stand_in_for_a_tilt(data_dir: Path, t
     """Its inertia was surely there, its damping and friction were below zero."""
     found, _ = hidden_in(tmp_path, "panda", "gravity_tilt", 1009121, forbid=True)
     assert "coupled_transmission" not in [cause.name.effect for cause in found.causes]
+
+
+@pytest.mark.slow
+def test_recordings_of_one_robot_that_have_nothing_in_common_tell_the_same_of_it(
+    data_dir: Path, tmp_path: Path
+) -> None:
+    """A UR10e in four groups of three recordings: friction by load and the rotors of its drives, each of one size."""
+    from benchmarks import same_robot
+
+    told = [same_robot.answered("ur10e", k, task, tmp_path) for k, task in enumerate(same_robot.ur10e())]
+    sizes = [
+        {(c["effect"], *c["at"]): next(iter(c["parameters"].values())) for c in answer["causes"]} for answer in told
+    ]
+    common = set.intersection(*map(set, sizes))
+    for cause in common:
+        for one, other in combinations([own[cause] for own in sizes], 2):
+            assert abs(one["value"] - other["value"]) <= 2.5 * np.hypot(one["std"], other["std"]), cause
+    drives = {
+        ("rotor_inertia", f"{joint}_joint") for joint in ("shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+    }
+    loads = {("load_dependent_friction", f"{joint}_joint") for joint in ("shoulder_lift", "elbow")}
+    assert common >= drives | loads
+    assert all(("rotor_inertia", "shoulder_pan_joint") in own for own in sizes[:3])
+    seen = {cause[0] for own in sizes for cause in own}
+    assert seen <= {"rotor_inertia", "load_dependent_friction", "power_law_friction", "torque_gain"}

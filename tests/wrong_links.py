@@ -24,6 +24,7 @@ class Wrong(NamedTuple):
     told: Name | None  # None: nothing
     number: str = ""  # a number that is to be told with it,
     size: float = 0.0  # and how large it is
+    beside: tuple[Name, ...] = ()  # what else is there
 
 
 def hand(folder: Path, seed: int) -> Wrong:
@@ -49,12 +50,26 @@ def moved(folder: Path, seed: int) -> Wrong:
 def rotor(folder: Path, seed: int) -> Wrong:
     """The drive of the first joint has a rotor, of which the file says nothing."""
     truth, inertia = arm(folder, 0.005, seed), float(np.random.default_rng(seed).uniform(0.3, 0.8))
-    turning = []
-    for one in _recordings(truth, seed):
-        torque = np.array(one.torque)
-        torque[:, 0] += inertia * np.gradient(np.gradient(one.position[:, 0], 1 / RATE), 1 / RATE)
-        turning.append(replace(one, torque=torque))
-    return Wrong(truth.file, turning, Name("rotor_inertia", ("shoulder",)), "inertia", inertia)
+    each = inertia * np.eye(truth.model.nv)[0]
+    return Wrong(truth.file, _turning(truth, each, seed), Name("rotor_inertia", ("shoulder",)), "inertia", inertia)
+
+
+def rotors(folder: Path, seed: int) -> Wrong:
+    """Every drive has a rotor, of which the file says nothing."""
+    truth, rng = arm(folder, 0.02, seed), np.random.default_rng(seed)
+    inertia = rng.uniform(0.5, 1.5, truth.model.nv) * _about_joints(truth)
+    first, *others = _drives(truth)
+    return Wrong(truth.file, _turning(truth, inertia, seed), first, "inertia", float(inertia[0]), tuple(others))
+
+
+def load(folder: Path, seed: int) -> Wrong:
+    """The same with a load at the last link, which is no rotor: it weighs something."""
+    truth, rng = arm(folder, 0.02, seed), np.random.default_rng(seed)
+    inertia, mass = rng.uniform(0.5, 1.5, truth.model.nv) * _about_joints(truth), float(rng.uniform(0.5, 1.5))
+    place = pin.SE3(np.eye(3), rng.uniform(-0.05, 0.1, 3))
+    truth.model.inertias[truth.model.nv] += place.act(pin.Inertia.FromSphere(mass, 0.04))
+    others = (Name("link_inertia", ("rod",)), *_drives(truth))
+    return Wrong(truth.file, _turning(truth, inertia, seed), Name("payload", ("rod",)), "mass", mass, others)
 
 
 def gain(folder: Path, seed: int) -> Wrong:
@@ -71,7 +86,7 @@ def right(folder: Path, seed: int) -> Wrong:
 
 
 KINDS: dict[str, Callable[[Path, int], Wrong]] = {
-    "hand": hand, "moved": moved, "rotor": rotor, "gain": gain, "right": right,
+    "hand": hand, "moved": moved, "rotor": rotor, "rotors": rotors, "load": load, "gain": gain, "right": right,
 }  # fmt: skip
 
 
@@ -80,3 +95,23 @@ def _recordings(truth: Truth, seed: int) -> list[Recording]:
         recording(truth, 15.0, seed, name="first"),
         recording(truth, 15.0, seed + 1, name="last", role="holdout"),
     ]
+
+
+def _turning(truth: Truth, inertia: np.ndarray, seed: int) -> list[Recording]:
+    """Recordings with rotors of this inertia at each joint."""
+    return [
+        replace(
+            one,
+            torque=np.array(one.torque) + inertia * np.gradient(np.gradient(one.position, axis=0), axis=0) * RATE**2,
+        )
+        for one in _recordings(truth, seed)
+    ]
+
+
+def _about_joints(truth: Truth) -> np.ndarray:
+    """Inertia of all links about each joint, stretched out."""
+    return np.diag(pin.crba(truth.model, truth.model.createData(), pin.neutral(truth.model)))
+
+
+def _drives(truth: Truth) -> list[Name]:
+    return [Name("rotor_inertia", (joint,)) for joint in truth.nominal.joint_names]

@@ -33,6 +33,7 @@ from ..simulators.registry import backend as make_backend
 from .answer_fit import as_moves, as_predicts_best, as_weighed_in_motion, as_weighed_otherwise, together
 from .believed import impossible_links
 from .comparison import t_value
+from .drives import rotors_for_bodies
 from .estimates import amplitude_places, estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
@@ -261,6 +262,7 @@ def _fitted_together(
 ) -> tuple[list[Found], Joint, tuple[Nearest, ...]]:
     """The causes that the others do not make needless and that surely have a size, all in one fit; and the others."""
     problem, start, whitening = here.problem, here.start, here.whitening
+    found = rotors_for_bodies(problem, start, found, whitening, forbid)
     found, needless = eliminate(problem, start, found, whitening)
     gone = [Nearest(one.name, share, _NEEDLESS) for one, share in needless]
     joint = together(here, found)
