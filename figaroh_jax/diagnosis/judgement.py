@@ -88,6 +88,10 @@ class KeptOut:
         """Whether they show it beyond doubt; never where nothing is kept out."""
         return bool(self.searched.here.problem.held.any()) and self.fall(name).certainly(self.claims[name])
 
+    def gain(self, name: Name) -> float:
+        """Share of the squares of its joints there that it takes, where they show it beyond doubt."""
+        return self.fall(name).own if self.certain(name) else 0.0
+
     def fall(self, name: Name) -> Fall:
         """By how much the error on what is kept out falls with the cause in, beside all others."""
         if name not in self.falls:
@@ -146,9 +150,13 @@ def reasons_against(
         rests = [rest or bool(rough[own].any()) for rest, own in zip(rests, places, strict=True)]
     asked = (tolerance, kept_out.certain, searched.fading)
     pairs = list(zip(each, rests, strict=True))
-    against = {one.name: reason_against(one, rest, *asked) for one, rest in pairs}
+
+    def reason(one: Standing, rest: bool, elsewhere: bool = False) -> str:
+        return reason_against(one, rest, *asked, kept_out=kept_out.gain, elsewhere=elsewhere)
+
+    against = {one.name: reason(one, rest) for one, rest in pairs}
     alike = elsewhere_too(found, against, here.problem.model.nv)
-    against |= {one.name: reason_against(one, rest, *asked, elsewhere=True) for one, rest in pairs if one.name in alike}
+    against |= {one.name: reason(one, rest, True) for one, rest in pairs if one.name in alike}
     return against | behind_joints([one for one, rest in pairs if rest], against)
 
 

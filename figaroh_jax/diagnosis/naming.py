@@ -124,6 +124,7 @@ def reason_against(
     certain: Callable[[Name], bool] = lambda name: False,
     fading: Collection[Name] = (),
     *,
+    kept_out: Callable[[Name], float] = lambda name: 0.0,
     elsewhere: bool = False,
 ) -> str:
     """Why the cause is not named, in words with the number that failed; empty where it is.
@@ -131,12 +132,13 @@ def reason_against(
     Beside a `rest` it must explain much of its joints' error, and surely; without one it must only be there, with one
     amplitude: one that would rather vary predicts better on data that were not fitted, whether or not a rest shows.
     `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not or where it is
-    borderline; `fading` are those that were surely there and are gone in recordings kept out. A part that every drive
+    borderline, and `kept_out` the gain there of one that they do; `fading` are those that were surely there and are
+    gone in recordings kept out. A part that every drive
     has, and that is named at most joints `elsewhere`, need not take much of what a joint leaves (`elsewhere_too`).
     """
     checks = _of_all(one, tolerance)
     if rest or not (one.beside_rest or one.complete):  # what any rest looks like is taken on less only if it is all
-        checks = chain(checks, _of_those_beside_rest(one, rest, certain, fading, elsewhere))
+        checks = chain(checks, _of_those_beside_rest(one, rest, certain, fading, kept_out, elsewhere))
     return next((reason for passed, reason in checks if not passed), "")
 
 
@@ -170,7 +172,12 @@ def _of_all(one: Standing, tolerance: float) -> Iterator[tuple[bool, str]]:
 
 
 def _of_those_beside_rest(
-    one: Standing, rest: bool, certain: Callable[[Name], bool], fading: Collection[Name], elsewhere: bool
+    one: Standing,
+    rest: bool,
+    certain: Callable[[Name], bool],
+    fading: Collection[Name],
+    kept_out: Callable[[Name], float],
+    elsewhere: bool,
 ) -> Iterator[tuple[bool, str]]:
     """What a cause beside a rest is asked more. `certain` costs a fit: it is asked where the answer hangs on it."""
     least, most = (GAIN_NAMED_ROBOT, MODULATION_ROBOT) if one.whole else (GAIN_NAMED, MODULATION)
@@ -181,7 +188,7 @@ def _of_those_beside_rest(
         f"its gain on held-out data is not significant: t = {one.t:.1f}, {one.t_needed:.1f} needed",
     )
     yield (
-        one.gain >= least or elsewhere,
+        one.gain >= least or elsewhere or kept_out(one.name) >= least,
         f"it removes {100 * one.gain:.0f} % of the held-out error where it acts, {100 * least:.0f} % needed",
     )
     yield (

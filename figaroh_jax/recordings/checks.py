@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from ..errors import InputError
 from ..rigid.model import RobotModel, prismatic
@@ -123,7 +123,11 @@ def check_recording(recording: Recording, model: RobotModel, entry: RecordingEnt
     for check in (_velocity, _speeds, _held_samples, _coarse, _clipped):
         found += check(look)
     if motion is not None and recording.torque is not None and not _stands(recording):
-        found += torque_findings(replace(look, model=carrying(model, recording.load)), motion)
+        sound = _soundest(look)
+        if sound != slice(0, len(recording.time)):  # wild samples are told; they say nothing of the columns
+            motion = sampled(recording.time[sound], recording.position[sound], recording.torque[sound])
+        if motion is not None:
+            found += torque_findings(replace(look, model=carrying(model, recording.load)), motion)
     return found
 
 
@@ -289,17 +293,10 @@ def _far(look: Look, far: np.ndarray, over: np.ndarray) -> Iterator[Finding]:
 
 def _jumps(look: Look) -> Iterator[Finding]:
     """Single wild rows and turns of 2 pi that the encoder lost."""
-    position, time = look.position, look.recording.time
-    steps, dt = np.diff(position, axis=0), np.diff(time)[:, None]
-    each = np.abs(steps) / np.maximum(np.round(dt / np.median(dt)), 1.0)  # a gap in the stamps is no jump
-    _, _, speed, _ = _limits(look.model)
+    position, steps = look.position, np.diff(look.position, axis=0)
     low, high, *_ = _limits(look.model)
-    usual = np.percentile(np.abs(steps), 98, axis=0) + 1e-9
-    allowed = np.where(np.isfinite(speed), 5 * speed * dt, np.inf)
     turns = ~np.array(prismatic(look.model))
-    least = np.where(turns, 0.1, 0.01)
-    wild = (each > 20 * usual) & (np.abs(steps) > least)
-    wild &= (np.abs(steps) > allowed) | (np.abs(steps) > 1.0) | (each > 200 * usual)
+    wild = _wild_steps(look)
     for j in np.flatnonzero(wild.any(axis=0)).tolist():
         rows = np.flatnonzero(wild[:, j]) + 1
         biggest = steps[rows - 1, j]
@@ -321,17 +318,61 @@ def _jumps(look: Look) -> Iterator[Finding]:
         )
 
 
+def _wild_steps(look: Look) -> Bool[np.ndarray, "steps nv"]:
+    """Steps of the position from one row to the next that no joint makes."""
+    steps, dt = np.diff(look.position, axis=0), np.diff(look.recording.time)[:, None]
+    each = np.abs(steps) / np.maximum(np.round(dt / np.median(dt)), 1.0)  # a gap in the stamps is no jump
+    _, _, speed, _ = _limits(look.model)
+    usual = np.percentile(np.abs(steps), 98, axis=0) + 1e-9
+    allowed = np.where(np.isfinite(speed), 5 * speed * dt, np.inf)
+    least = np.where(prismatic(look.model), 0.01, 0.1)
+    wild = (each > 20 * usual) & (np.abs(steps) > least)
+    return wild & ((np.abs(steps) > allowed) | (np.abs(steps) > 1.0) | (each > 200 * usual))
+
+
+def _lost_rows(values: Float[np.ndarray, "rows nv"]) -> Int[np.ndarray, " lost"]:
+    """Rows of zeros in the middle of a motion."""
+    steps = np.abs(np.diff(values, axis=0))
+    usual = np.percentile(steps, 95, axis=0)
+    sudden = np.mean((steps > 3 * usual) & (steps > 0), axis=1) > 0.49
+    return np.flatnonzero((values[1:-1] == 0).all(axis=1) & (sudden[:-1] | sudden[1:])) + 1
+
+
+def _wild_torque(look: Look) -> Bool[np.ndarray, "rows nv"]:
+    """Torque far beyond what a joint can give, and beyond all others of it."""
+    torque = look.recording.torque
+    assert torque is not None
+    effort = _limits(look.model)[3]
+    ceiling = np.where(np.isfinite(effort), effort, 1e4)
+    usual, top = np.percentile(np.abs(torque), 99, axis=0), np.abs(torque).max(axis=0)
+    wild = (top > 3 * ceiling) & (top > 10 * usual)
+    return wild & (np.abs(torque) > np.maximum(3 * ceiling, 10 * usual))
+
+
+def _soundest(look: Look) -> slice:
+    """The longest stretch of rows without wild samples: what these make of a motion says nothing of its columns."""
+    position, torque = look.position, look.recording.torque
+    wild = np.zeros(len(position), bool)
+    steps = _wild_steps(look).any(axis=1)
+    wild[1:] |= steps
+    wild[:-1] |= steps
+    if position.shape[1] > 1:
+        wild[_lost_rows(position)] = True
+    if torque is not None:
+        wild |= _wild_torque(look).any(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], wild, [True]]).astype(int)))
+    first, after = edges[::2], edges[1::2]
+    longest = int(np.argmax(after - first)) if len(first) else 0
+    return slice(int(first[longest]), int(after[longest])) if len(first) else slice(0, 0)
+
+
 def _zero_rows(look: Look) -> Iterator[Finding]:
     """Rows of zeros in the middle of a motion: packets that never came."""
     for key in ("position", "torque"):
         values = getattr(look.recording, key)
         if values is None or values.shape[1] < 2 or not values.any():
             continue
-        steps = np.abs(np.diff(values, axis=0))
-        usual = np.percentile(steps, 95, axis=0)
-        sudden = np.mean((steps > 3 * usual) & (steps > 0), axis=1) > 0.49
-        rows = np.flatnonzero((values[1:-1] == 0).all(axis=1) & (sudden[:-1] | sudden[1:])) + 1
-        if len(rows):
+        if len(rows := _lost_rows(values)):
             yield Finding(
                 False,
                 f"{key} is zero at every joint in row {rows[0]} (from 0){and_more(rows)}: lost packets?"
@@ -489,9 +530,10 @@ def _torque_values(look: Look) -> Iterator[Finding]:
     effort = _limits(look.model)[3]
     ceiling = np.where(np.isfinite(effort), effort, 1e4)
     usual, top = np.percentile(np.abs(torque), 99, axis=0), np.abs(torque).max(axis=0)
-    wild = (top > 3 * ceiling) & (top > 10 * usual)
+    samples = _wild_torque(look)
+    wild = samples.any(axis=0)
     for j in np.flatnonzero(wild).tolist():
-        rows = np.flatnonzero(np.abs(torque[:, j]) > np.maximum(3 * ceiling[j], 10 * usual[j]))
+        rows = np.flatnonzero(samples[:, j])
         yield Finding(
             bool(top[j] > 1e3 * ceiling[j]),
             f"torque of {look.joints[j]} reads {torque[rows[0], j]:.4g} {effort_unit(look, j)} in row {rows[0]} (from"
