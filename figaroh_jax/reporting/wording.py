@@ -60,9 +60,12 @@ def sentence(diagnosis: Diagnosis, robot: str) -> str:
 
 
 def _filed(diagnosis: Diagnosis) -> str:
-    """That the links of the file are not as the torque has them, and what the most of it looks like; may be empty."""
+    """That the links of the file are not as the torque has them, and what the most of it looks like.
+
+    Empty where they are, or where no link can be told.
+    """
     links = diagnosis.links
-    if links is None or diagnosis.rest.contradicts:
+    if links is None or not links.moved or diagnosis.rest.contradicts:
         return ""
     first = links.moved[: next((k for k, one in enumerate(links.moved, 1) if one.share > _MOST), len(links.moved))]
     gone = [one.note for one in first if one.note.startswith("as if ")]
