@@ -53,7 +53,8 @@ def test_a_hand_of_the_file_that_is_not_mounted_is_told_with_its_mass(tmp_path: 
     assert first.numbers["mass"].value == pytest.approx(wrong.size, abs=0.15 * -wrong.size), (seed, first)
     assert first.note in wording.sentence(found, "bench")
     none_told = replace(found, links=replace(told(found), moved=()))
-    assert "masses and inertias" not in wording.sentence(none_told, "bench")  # of the UR10e's joints moved one by one
+    assert "the model file do not fit" in wording.sentence(found, "bench")
+    assert "the model file do not fit" not in wording.sentence(none_told, "bench")  # nor "what looks like ."
     assert len(wording.links(none_told)) == 1
     kept = answer.answer(found)["links"]
     assert (kept["moved"][0]["effect"], kept["moved"][0]["at"]) == ("link_inertia", ["rod"])

@@ -303,7 +303,7 @@ def test_what_most_drives_have_need_not_take_much_at_one_more_joint(changes: dic
 
 @pytest.mark.parametrize(("kept_out", "word"), [(0.4, ""), (0.2, "held-out error")])
 def test_what_recordings_kept_out_show_beyond_doubt_counts_as_the_gain(kept_out: float, word: str) -> None:
-    """Slices of 16 recordings of a UR10e give its friction by load .23 of the shoulder's squares, those kept out .48."""
+    """Friction by load of a UR10e's shoulder takes .23 in slices of 12 recordings and .48 of six kept out."""
     reason = reason_against(replace(RIGHT, gain=0.22), True, 0.01, kept_out=lambda name: kept_out)
     assert word in reason and bool(word) == bool(reason)
 
