@@ -182,13 +182,14 @@ def _of_those_beside_rest(
     """What a cause beside a rest is asked more. `certain` costs a fit: it is asked where the answer hangs on it."""
     least, most = (GAIN_NAMED_ROBOT, MODULATION_ROBOT) if one.whole else (GAIN_NAMED, MODULATION)
     varying = one.modulation if one.whole else _without_chance(one.modulation, one.modulation_held_out)
+    steadily = one.t >= one.t_needed and varying <= most  # slices show it surely, though not how much it takes
     margin = _together_beyond(max(one.t / one.t_needed, 1.0), one.gain / least, most / max(varying, 1e-9))
     yield (
         one.t >= one.t_needed or certain(one.name),
         f"its gain on held-out data is not significant: t = {one.t:.1f}, {one.t_needed:.1f} needed",
     )
     yield (
-        one.gain >= least or elsewhere or kept_out(one.name) >= least,
+        one.gain >= least or elsewhere or (steadily and kept_out(one.name) >= least),
         f"it removes {100 * one.gain:.0f} % of the held-out error where it acts, {100 * least:.0f} % needed",
     )
     yield (
