@@ -19,6 +19,7 @@ from wrong_links import Wrong
 
 import figaroh_jax as fj
 from figaroh_jax.diagnosis.diagnosis import diagnose
+from figaroh_jax.diagnosis.drives import AS_ROTORS
 from figaroh_jax.formats.config import Preprocess
 from figaroh_jax.formats.robotfile import read_robot, welded_to
 from figaroh_jax.reporting import answer, wording
@@ -100,6 +101,7 @@ def test_rotors_of_all_drives_are_named_and_no_body_that_holds_them(seed: int, t
     found = diagnosed(wrong)
     assert sure(wrong, found, seed) == {wrong.told, *wrong.beside}
     assert found.links is None
+    assert any(one.why_not == AS_ROTORS for one in found.rest.nearest), found.rest.nearest
 
 
 def test_nothing_but_rotors_is_told_of_a_file_that_lacks_them(tmp_path: Path) -> None:

@@ -262,9 +262,9 @@ def _fitted_together(
 ) -> tuple[list[Found], Joint, tuple[Nearest, ...]]:
     """The causes that the others do not make needless and that surely have a size, all in one fit; and the others."""
     problem, start, whitening = here.problem, here.start, here.whitening
-    found = rotors_for_bodies(problem, start, found, whitening, forbid)
+    found, bodies = rotors_for_bodies(problem, start, found, whitening, forbid)
     found, needless = eliminate(problem, start, found, whitening)
-    gone = [Nearest(one.name, share, _NEEDLESS) for one, share in needless]
+    gone = [*bodies, *(Nearest(one.name, share, _NEEDLESS) for one, share in needless)]
     joint = together(here, found)
     kept = _simple(here, found, joint, forbid, tolerance)
     if kept != found:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from ..effects.base import place
 from ..effects.transmission import RotorInertia
-from ..results import Name
+from ..results import Name, Nearest
 from ..rigid.model import RobotModel
 from .comparison import t_value
 from .estimates import amplitude_places
@@ -26,20 +26,22 @@ from .state import State
 from .step import Step, with_causes
 from .thresholds import T_ALIKE
 
-__all__ = ["rotors_for_bodies"]
+__all__ = ["AS_ROTORS", "rotors_for_bodies"]
+
+AS_ROTORS = "rotors of the joints that carry it explain as much, one number each"
 
 
 def rotors_for_bodies(
     problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"], forbid: Collection[str]
-) -> list[Found]:
-    """The causes, each body as the rotors of the joints that carry it where these predict left-out data as well."""
+) -> tuple[list[Found], list[Nearest]]:
+    """The causes, each body as the rotors of the joints that carry it where these predict left-out data as well; and
+    the bodies that have gone."""
+    gone = list[Nearest]()
     if problem.bounded or RotorInertia.name in forbid:
-        return found
+        return found, gone
     for body in [f for f in found if f.effect.body]:
         own = _carriers(problem.model, body)
         joints = sorted(own - _with_rotor(start, found))
-        if not own or not (joints or own & _with_rotor(start, found)):
-            continue
         full = with_causes(problem, start, [f.effect for f in found], whitening)
         while True:
             rotors = [_rotor(problem.model, j, body) for j in joints]
@@ -49,10 +51,13 @@ def rotors_for_bodies(
             if all(size > 0 for size in sizes):
                 break
             joints = [j for j, size in zip(joints, sizes, strict=True) if size > 0]
-        if _as_well(full, step, len(body.effect.amplitudes()) - len(joints)):
+        turning = own & _with_rotor(start, others)
+        if turning and _as_well(full, step, len(body.effect.amplitudes()) - len(joints)):
             told = [_told(problem, start, step, others, one, body, whitening) for one in rotors]
             found = [*(f for f in found if f is not body), *told]
-    return found
+            worse, better = (one.verdicts.own(one.rows, body.joints).sum() for one in (step, full))
+            gone.append(Nearest(body.name, 1 - float(better / worse), AS_ROTORS))
+    return found, gone
 
 
 def _as_well(full: Step, step: Step, fewer: int) -> bool:

@@ -133,8 +133,8 @@ def reason_against(
     amplitude: one that would rather vary predicts better on data that were not fitted, whether or not a rest shows.
     `certain` says whether recordings kept out show it beyond doubt, where slices of the others do not or where it is
     borderline, and `kept_out` the gain there of one that they do; `fading` are those that were surely there and are
-    gone in recordings kept out. A part that every drive
-    has, and that is named at most joints `elsewhere`, need not take much of what a joint leaves (`elsewhere_too`).
+    gone in recordings kept out. A part that every drive has, and that is named at most joints `elsewhere`, need not
+    take much of what a joint leaves (`elsewhere_too`).
     """
     checks = _of_all(one, tolerance)
     if rest or not (one.beside_rest or one.complete):  # what any rest looks like is taken on less only if it is all
