@@ -15,6 +15,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
 from pathlib import Path
@@ -33,13 +34,14 @@ UR10E = (  # the last of each is kept out
     ("20_02_19_14harm50sec", "20_02_06_20sec_5harm", "20_02_05_20sec_12harm"),
     ("20_02_19_15harm50sec", "20_01_31_unload", "19_12_23_free"),
 )
+UR10E_2019 = ("19_10_01_13_51_41", "19_10_01_14_04_13", "19_10_01_14_04_41", "19_09_27_11_28_22", "19_09_27_15_11_06")
 PENDULUM = (
     ("143339", "143524", "143601", "143704", "154220", "154548"),  # those of `hide_in_real`
     ("143747", "143906", "144003", "144115"),
 )
 
 
-def ur10e() -> list[Task]:
+def ur10e(groups: Sequence[Sequence[str]] = UR10E) -> list[Task]:
     """Four groups of three recordings, two fitted."""
     joints = [f"{n}_joint" for n in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")]
     folder = DATA / "ur10e_innopolis"
@@ -50,7 +52,12 @@ def ur10e() -> list[Task]:
         "baseline": {"offset": True},
         "transmission": {"torque": np.diag(UR_GAIN).tolist()},
     }
-    return [task | {"data": _data(folder / "id", runs, entry)} for runs in UR10E]
+    return [task | {"data": _data(folder / "id", runs, entry)} for runs in groups]
+
+
+def ur10e_2019() -> list[Task]:
+    """Five short recordings of the same robot that no rule was set on."""
+    return ur10e([UR10E_2019])
 
 
 def tx40() -> list[Task]:
@@ -81,10 +88,16 @@ def dfki_double_pendulum() -> list[Task]:
     return [task | {"data": _data(folder, [f"C1_20230629-{k}" for k in runs], entry)} for runs in PENDULUM]
 
 
-ROBOTS = {"ur10e": ur10e, "tx40": tx40, "tiago": tiago, "dfki_double_pendulum": dfki_double_pendulum}
+ROBOTS = {
+    "ur10e": ur10e,
+    "ur10e_2019": ur10e_2019,
+    "tx40": tx40,
+    "tiago": tiago,
+    "dfki_double_pendulum": dfki_double_pendulum,
+}
 
 
-def _data(folder: Path, runs: Any, entry: Task) -> list[Task]:
+def _data(folder: Path, runs: Sequence[str], entry: Task) -> list[Task]:
     roles = [*["fit"] * (len(runs) - 1), "holdout"]
     return [{"file": str(folder / f"{run}.npz"), "role": role} | entry for run, role in zip(runs, roles, strict=True)]
 
