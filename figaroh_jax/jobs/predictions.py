@@ -37,5 +37,6 @@ def predictions(
                 torque = predict(loaded, motion.time, *state, motion.dt)
             else:
                 torque = loaded.inverse_dynamics(*state)
-            found[recording.name] = recording.time, to_recording_times(motion.time, np.asarray(torque), recording.time)
+            stamps = recording.time if recording.stamps is None else recording.stamps
+            found[recording.name] = stamps, to_recording_times(motion.time, np.asarray(torque), stamps)
     return found

@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from ..errors import InputError
 from ..rigid.model import RobotModel, prismatic
@@ -22,6 +22,7 @@ from .dataset import Memory, Recording, carrying
 from .findings import LIKE, SOFT, UNLIKE, Finding, Look, and_more, effort_unit, named, unit_of
 from .likeness import sampled
 from .torque_checks import torque_findings
+from .wild import limits, lost_rows, pulses, wild_steps, wild_torque
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -115,7 +116,7 @@ def check_recording(recording: Recording, model: RobotModel, entry: RecordingEnt
     motion = sampled(recording.time, recording.position, recording.torque)
     unit = entry.units.position if entry is not None else "rad"
     look = Look(recording.position, recording.joints, model, unit, recording, entry, motion, recording.time)
-    found: list[Finding] = []
+    found = [Finding(False, recording.wild)] if recording.wild else []
     for check in (_clock, _unit_without_joint, _ranges, _jumps, _zero_rows, _torque_values):
         found += check(look)
     if any(finding.wrong for finding in found):
@@ -145,6 +146,7 @@ def check_rollouts(task: Task, model: RobotModel, recordings: Sequence[Recording
         if len(recording.time) >= FEWEST and recording.position.shape[1] == model.nv:
             told = [finding for check in (_clock, _unit_without_joint, _ranges) for finding in check(look)]
             told += () if any(finding.wrong for finding in told) else _jumps(look)
+            told += [Finding(False, recording.wild)] if recording.wild else []
             found += [(recording.file.name, finding) for finding in told]
     return report_findings(found)
 
@@ -175,15 +177,6 @@ def _stands(recording: Recording) -> bool:
     return bool((high - low < STILL).all())
 
 
-def _limits(model: RobotModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Lower and upper position, speed and torque; infinite where the model gives none (zero counts as none)."""
-    low, high = np.asarray(model.position_limit, float).T
-    none = ~(high > low)
-    rates = [np.asarray(x, float) for x in (model.velocity_limit, model.effort_limit)]
-    speed, effort = (np.where(x > 0, x, np.inf) for x in rates)
-    return np.where(none, -np.inf, low), np.where(none, np.inf, high), speed, effort
-
-
 # Time
 
 
@@ -194,7 +187,7 @@ def _clock(look: Look) -> Iterator[Finding]:
     if step < 0.1 or _stands(look.recording):
         return
     unit, seconds = next(((u, s) for u, s in _CLOCKS if 1e-5 < step * s <= 0.1), ("ms", 1e-3))
-    _, _, speed, _ = _limits(look.model)
+    _, _, speed, _ = limits(look.model)
     top = np.abs(np.diff(look.position, axis=0)).max(axis=0) / step
     slow = bool((top < 0.02 * np.where(np.isfinite(speed), speed, 3.0)).all())
     advice = f"the stamps look like {unit}: add units: {{time: {unit}}}"
@@ -233,7 +226,7 @@ def _unit_without_joint(look: Look) -> Iterator[Finding]:
 
 def _small(look: Look, turns: np.ndarray) -> bool:
     """Whether a motion in degrees is so small that it fits the joints when it is read as rad."""
-    low, high, *_ = _limits(look.model)
+    low, high, *_ = limits(look.model)
     span = look.span[turns]
     fits = bool((span / DEGREE <= 1.1 * (high - low)[turns]).all())
     return bool(2e-5 < span.max() < (0.2 if fits and np.isfinite(high - low)[turns].all() else 0.12))
@@ -244,7 +237,7 @@ def _small(look: Look, turns: np.ndarray) -> bool:
 
 def _ranges(look: Look) -> Iterator[Finding]:
     """Positions far outside what the model's joints can reach."""
-    low, high, speed, _ = _limits(look.model)
+    low, high, speed, _ = limits(look.model)
     bottom, top = np.percentile(look.position, [2, 98], axis=0)
     turns = ~np.array(prismatic(look.model))
     room = np.where(np.isfinite(high - low), high - low, 4 * np.pi)
@@ -270,7 +263,7 @@ def _ranges(look: Look) -> Iterator[Finding]:
 
 
 def _far(look: Look, far: np.ndarray, over: np.ndarray) -> Iterator[Finding]:
-    low, high, *_ = _limits(look.model)
+    low, high, *_ = limits(look.model)
     position, worst = look.position, int(np.argmax(np.where(far, over, 0.0)))
     straight = np.array(prismatic(look.model))
     factor = np.where(straight, 1e-3, DEGREE)
@@ -294,9 +287,9 @@ def _far(look: Look, far: np.ndarray, over: np.ndarray) -> Iterator[Finding]:
 def _jumps(look: Look) -> Iterator[Finding]:
     """Single wild rows and turns of 2 pi that the encoder lost."""
     position, steps = look.position, np.diff(look.position, axis=0)
-    low, high, *_ = _limits(look.model)
+    low, high, *_ = limits(look.model)
     turns = ~np.array(prismatic(look.model))
-    wild = _wild_steps(look)
+    wild = wild_steps(look.position, look.recording.time, look.model)
     for j in np.flatnonzero(wild.any(axis=0)).tolist():
         rows = np.flatnonzero(wild[:, j]) + 1
         biggest = steps[rows - 1, j]
@@ -318,48 +311,17 @@ def _jumps(look: Look) -> Iterator[Finding]:
         )
 
 
-def _wild_steps(look: Look) -> Bool[np.ndarray, "steps nv"]:
-    """Steps of the position from one row to the next that no joint makes."""
-    steps, dt = np.diff(look.position, axis=0), np.diff(look.recording.time)[:, None]
-    each = np.abs(steps) / np.maximum(np.round(dt / np.median(dt)), 1.0)  # a gap in the stamps is no jump
-    _, _, speed, _ = _limits(look.model)
-    usual = np.percentile(np.abs(steps), 98, axis=0) + 1e-9
-    allowed = np.where(np.isfinite(speed), 5 * speed * dt, np.inf)
-    least = np.where(prismatic(look.model), 0.01, 0.1)
-    wild = (each > 20 * usual) & (np.abs(steps) > least)
-    return wild & ((np.abs(steps) > allowed) | (np.abs(steps) > 1.0) | (each > 200 * usual))
-
-
-def _lost_rows(values: Float[np.ndarray, "rows nv"]) -> Int[np.ndarray, " lost"]:
-    """Rows of zeros in the middle of a motion."""
-    steps = np.abs(np.diff(values, axis=0))
-    usual = np.percentile(steps, 95, axis=0)
-    sudden = np.mean((steps > 3 * usual) & (steps > 0), axis=1) > 0.49
-    return np.flatnonzero((values[1:-1] == 0).all(axis=1) & (sudden[:-1] | sudden[1:])) + 1
-
-
-def _wild_torque(look: Look) -> Bool[np.ndarray, "rows nv"]:
-    """Torque far beyond what a joint can give, and beyond all others of it."""
-    torque = look.recording.torque
-    assert torque is not None
-    effort = _limits(look.model)[3]
-    ceiling = np.where(np.isfinite(effort), effort, 1e4)
-    usual, top = np.percentile(np.abs(torque), 99, axis=0), np.abs(torque).max(axis=0)
-    wild = (top > 3 * ceiling) & (top > 10 * usual)
-    return wild & (np.abs(torque) > np.maximum(3 * ceiling, 10 * usual))
-
-
 def _soundest(look: Look) -> slice:
     """The longest stretch of rows without wild samples: what these make of a motion says nothing of its columns."""
     position, torque = look.position, look.recording.torque
     wild = np.zeros(len(position), bool)
-    steps = _wild_steps(look).any(axis=1)
+    steps = wild_steps(look.position, look.recording.time, look.model).any(axis=1)
     wild[1:] |= steps
     wild[:-1] |= steps
     if position.shape[1] > 1:
-        wild[_lost_rows(position)] = True
+        wild[lost_rows(position)] = True
     if torque is not None:
-        wild |= _wild_torque(look).any(axis=1)
+        wild |= wild_torque(torque, look.model).any(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[True], wild, [True]]).astype(int)))
     first, after = edges[::2], edges[1::2]
     longest = int(np.argmax(after - first)) if len(first) else 0
@@ -372,7 +334,7 @@ def _zero_rows(look: Look) -> Iterator[Finding]:
         values = getattr(look.recording, key)
         if values is None or values.shape[1] < 2 or not values.any():
             continue
-        if len(rows := _lost_rows(values)):
+        if len(rows := lost_rows(values)):
             yield Finding(
                 False,
                 f"{key} is zero at every joint in row {rows[0]} (from 0){and_more(rows)}: lost packets?"
@@ -479,7 +441,7 @@ def _speeds(look: Look) -> Iterator[Finding]:
     """Speed and its model's limit."""
     if look.motion is None:
         return
-    _, _, limit, _ = _limits(look.model)
+    _, _, limit, _ = limits(look.model)
     top = np.percentile(np.abs(look.motion.velocity), 99, axis=0)
     fast = top > SOFT * limit
     if not fast.any():
@@ -527,10 +489,10 @@ def _torque_values(look: Look) -> Iterator[Finding]:
     dead = np.ptp(torque, axis=0) == 0
     if dead.any():
         yield Finding(False, f"torque of {named(look, dead)} never changes: it was not measured there")
-    effort = _limits(look.model)[3]
+    effort = limits(look.model)[3]
     ceiling = np.where(np.isfinite(effort), effort, 1e4)
     usual, top = np.percentile(np.abs(torque), 99, axis=0), np.abs(torque).max(axis=0)
-    samples = _wild_torque(look)
+    samples = wild_torque(torque, look.model)
     wild = samples.any(axis=0)
     for j in np.flatnonzero(wild).tolist():
         rows = np.flatnonzero(samples[:, j])
@@ -539,6 +501,7 @@ def _torque_values(look: Look) -> Iterator[Finding]:
             f"torque of {look.joints[j]} reads {torque[rows[0], j]:.4g} {effort_unit(look, j)} in row {rows[0]} (from"
             f" 0){and_more(rows)}, limit {ceiling[j]:.4g}: wild samples; delete these rows",
         )
+    yield from _pulse(look)
     high = (usual > SOFT * ceiling) & ~wild
     if high.any():
         worst = int(np.argmax(usual / ceiling))
@@ -548,6 +511,24 @@ def _torque_values(look: Look) -> Iterator[Finding]:
             f" ({look.joints[worst]}: {usual[worst]:.4g} {effort_unit(look, worst)}): is it in mN m, a share of the"
             " rated torque, or a current (units: {torque: A} with transmission.torque)?",
         )
+
+
+def _pulse(look: Look) -> Iterator[Finding]:
+    """Torque of a row or two that no other supports; the largest of a recording is told."""
+    torque = look.recording.torque
+    assert torque is not None
+    alone = pulses(torque)
+    if not alone.any():
+        return
+    before = np.abs(np.diff(torque, axis=0, prepend=torque[:1]))
+    k, j = np.unravel_index(int(np.argmax(np.where(alone, before, -1.0))), alone.shape)
+    after = k + 1 + int(np.argmin(np.append(alone[k + 1 :, j], False)))
+    yield Finding(
+        False,
+        f"torque of {look.joints[j]} is {torque[k, j]:.4g} {effort_unit(look, int(j))} in row {k} (from 0),"
+        f" {torque[k - 1, j]:.4g} before and {torque[after, j]:.4g} after it"
+        f"{and_more(np.flatnonzero(alone.any(axis=1)))}: a sudden stop, or wild samples, which are to be deleted",
+    )
 
 
 def _clipped(look: Look) -> Iterator[Finding]:

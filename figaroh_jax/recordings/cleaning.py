@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float
 
 from ..errors import InputError
 from .dataset import Recording
+from .wild import without_wild_rows
 
-__all__ = ["median_filter", "near", "savitzky_golay", "without_spikes", "without_untrusted"]
+__all__ = ["median_filter", "near", "savitzky_golay", "without_spikes", "without_untrusted", "without_wild_rows"]
 
 SPIKE = 8.0  # robust standard deviations from the running median
 

@@ -23,6 +23,7 @@ from ..rigid.model import RobotModel
 from .groupmotion import position_names
 from .reading import read_table
 from .tables import Source, Table
+from .wild import bridged, without_wild_rows
 
 if TYPE_CHECKING:
     from ..formats.config import Load, RecordingEntry, Task
@@ -70,6 +71,8 @@ class Recording:
     role: Literal["fit", "holdout"] = "fit"
     notes: tuple[str, ...] = ()
     trusted: Bool[np.ndarray, "samples nv"] | None = None  # False: torque that counts for nothing (see `cleaning`)
+    stamps: Float[np.ndarray, " all"] | None = None  # s, of all rows of the file, where some are left out
+    wild: str = ""  # which rows no robot made, and what was done (see `wild`)
 
 
 def read_recordings(
@@ -90,7 +93,8 @@ def read_recordings(
     """
     _check_names(task, model, floating, "commands" if rollouts else "joint torques")
     drive = Drive(task, model)
-    recordings = tuple(_read(entry, f"data[{k}]", model, drive) for k, entry in enumerate(task.data))
+    every = (_read(entry, f"data[{k}]", model, drive) for k, entry in enumerate(task.data))
+    recordings = tuple(bridged(one, model) if rollouts else without_wild_rows(one, model) for one in every)
     if rollouts:
         lacking = next((r for r in recordings if r.command is None), None)
         if lacking is not None:

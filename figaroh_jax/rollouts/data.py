@@ -84,12 +84,15 @@ def without_gaps(run: Run) -> tuple[Run, str]:
     row = np.concatenate([[0], np.cumsum(np.round(steps / period).astype(int))])
     every = np.arange(row[-1] + 1)
     filled = ~np.isin(every, row)
+    trusted = ~filled
+    if run.trusted is not None:
+        trusted[row] &= run.trusted
     new = run._replace(
         time=run.time[0] + period * every,
         command=run.command[np.searchsorted(row, every, side="right") - 1],
         position=_through(row, every, run.position),
         velocity=None if run.velocity is None else _through(row, every, run.velocity),
-        trusted=~filled,
+        trusted=trusted,
         stamps=run.time,
         filled=filled,
     )

@@ -148,7 +148,8 @@ def _run(loop: Loop, recording: Recording) -> tuple[Run, str]:
                 " Say `units: {position: deg}`, or convert it to the unit of the position"
             )
     held_out = recording.role == "holdout"
-    run = Run(recording.name, recording.time, command, recording.position, recording.velocity, held_out)
+    trusted = None if recording.trusted is None else np.logical_and.reduce(recording.trusted, axis=1)
+    run = Run(recording.name, recording.time, command, recording.position, recording.velocity, held_out, trusted)
     run, late = without_gaps(run)
     _check_order(loop, recording, run, follows, columns)
     return run, late

@@ -1,0 +1,215 @@
+"""Rows that no robot made are left out, and nothing else is: what is left is what a user had deleted by hand.
+
+Recordings are those of `generators`, which share no code with the library; rows are drawn and spoiled at run time.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from generators import make_case, make_closed_loop_case
+from test_rollout_diagnosis import task as rollout_task
+
+import figaroh_jax as fj
+from figaroh_jax.cli import main
+from figaroh_jax.errors import InputError
+from figaroh_jax.formats.config import load_task
+from figaroh_jax.formats.robotfile import load_robot
+from figaroh_jax.recordings.checks import check_recordings
+from figaroh_jax.recordings.dataset import Recording, read_recordings
+from figaroh_jax.recordings.wild import bridged, wild_rows, without_wild_rows
+from figaroh_jax.rigid.model import RobotModel
+from figaroh_jax.rollouts.task import read_rollouts
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.wild_rows import KINDS
+
+SEED = int.from_bytes(os.urandom(3), "little")  # told where a test fails
+MANY = 8
+FOUND = ["position", "lost", "torque"]  # a pulse of three times the largest torque may be a stop: it is told
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RobotModel, Recording]:
+    case = make_case([("stribeck_friction", 0.15)], robot="small", repeats=1, trajectories=1, seed=SEED)
+    task = load_task(case.write(tmp_path_factory.mktemp("case")))
+    robot = load_robot(task)
+    return robot, read_recordings(task, robot)[0]
+
+
+def spoiled(one: Recording, kind: str, rows: np.ndarray) -> Recording:
+    assert one.torque is not None
+    position, torque, rng = one.position.copy(), one.torque.copy(), np.random.default_rng(SEED)
+    for row in rows.tolist():
+        KINDS[kind](position, torque, row, rng)
+    return replace(one, position=position, torque=torque)
+
+
+def drawn(one: Recording) -> np.ndarray:
+    """Rows far enough from each other that what lies between them belongs to the motion."""
+    places = np.arange(40, len(one.time) - 40, 25)
+    return np.sort(np.random.default_rng(SEED).choice(places, MANY, replace=False))
+
+
+@pytest.mark.parametrize("kind", FOUND)
+def test_the_rows_that_were_spoiled_are_left_out_and_no_others(run: tuple[RobotModel, Recording], kind: str):
+    robot, one = run
+    rows = drawn(one)
+    found = wild_rows(spoiled(one, kind, rows), robot)
+    assert found is not None and np.flatnonzero(found.rows).tolist() == rows.tolist(), SEED
+    assert found.text.startswith(f"{MANY} wild rows are left out: "), found.text
+    less = without_wild_rows(spoiled(one, kind, rows), robot)
+    for key in ("time", "position", "torque"):
+        np.testing.assert_array_equal(getattr(less, key), np.delete(getattr(one, key), rows, axis=0))
+    assert less.stamps is not None and len(less.stamps) == len(one.time)
+
+
+def test_a_stretch_at_either_end_and_one_of_several_rows_are_left_out(run: tuple[RobotModel, Recording]):
+    robot, one = run
+    rng, rows = np.random.default_rng(SEED), np.r_[0:6, 400:407, len(one.time) - 3 : len(one.time)]
+    position = one.position.copy()
+    position[rows] += rng.uniform(2.0, 3.0, (len(rows), 1)) * rng.choice([-1, 1], position[rows].shape)
+    found = wild_rows(replace(one, position=position), robot)
+    assert found is not None and np.flatnonzero(found.rows).tolist() == rows.tolist(), SEED
+
+
+def test_a_joint_that_jumps_and_stays_there_is_told_and_stays(run: tuple[RobotModel, Recording]):
+    robot, one = run
+    position = one.position.copy()
+    position[len(position) // 2 :, 0] += 1.5
+    jumped = replace(one, position=position)
+    assert without_wild_rows(jumped, robot) is jumped
+    try:
+        said = "; ".join(check_recordings(None, robot, [jumped]))
+    except InputError as error:  # where it leaves the joint's limits by far
+        said = str(error)
+    assert "jumps by" in said or "outside" in said or "limits" in said, (SEED, said)
+
+
+def test_where_too_many_rows_are_wild_all_of_them_stay(run: tuple[RobotModel, Recording]):
+    robot, one = run
+    rows = np.arange(30, len(one.time) - 30, 20)
+    assert len(rows) > 0.02 * len(one.time)
+    assert wild_rows(spoiled(one, "torque", rows), robot) is None
+
+
+@pytest.mark.parametrize("effect", ["torque_saturation", "backlash", "presliding", "contact", "torque_ripple", None])
+def test_right_recordings_have_no_wild_rows(effect: str | None, tmp_path: Path):
+    case = make_case([(effect, 0.15)] if effect else [], robot="small", repeats=1, trajectories=2, seed=SEED)
+    task = load_task(case.write(tmp_path))
+    assert [one.wild for one in read_recordings(task, load_robot(task))] == ["", ""], SEED
+
+
+def test_a_drive_that_sticks_at_reversals_has_no_wild_rows(tmp_path: Path):
+    """MuJoCo C in closed loop: quantised encoders, noise of the current, dry friction that holds."""
+    task = load_task(make_closed_loop_case([], robot="small", seed=SEED).write(tmp_path))
+    assert not any(one.wild for one in read_recordings(task, load_robot(task))), SEED
+
+
+def test_a_pulse_that_may_be_a_stop_is_told_and_stays(run: tuple[RobotModel, Recording]):
+    robot, one = run
+    assert one.torque is not None
+    torque = one.torque.copy()
+    torque[300, 1] += 1.2 * np.ptp(np.percentile(torque[:, 1], [1, 99]))
+    alone = replace(one, torque=torque)
+    assert without_wild_rows(alone, robot) is alone
+    (told,) = check_recordings(None, robot, [alone])
+    assert "in row 300" in told and "a sudden stop, or wild samples" in told
+
+
+@pytest.mark.parametrize("kind", FOUND)
+def test_a_fit_is_that_of_the_recording_without_these_rows(kind: str, tmp_path: Path):
+    case = make_case([], robot="small", repeats=1, trajectories=2, seed=SEED)
+    paths = [case.write(tmp_path / name) for name in ("spoiled", "by_hand")]
+    files = sorted(path.name for path in paths[0].parent.glob("*.npz"))
+    for name in files:
+        arrays = dict(np.load(paths[0].parent / name))
+        rows = np.sort(np.random.default_rng(SEED).choice(np.arange(40, 900, 25), MANY, replace=False))
+        shorter = {key: np.delete(values, rows, axis=0) for key, values in arrays.items()}
+        np.savez(paths[1].parent / name, **shorter)  # pyright: ignore[reportArgumentType]
+        rng = np.random.default_rng(SEED)
+        for row in rows.tolist():
+            KINDS[kind](arrays["q"], arrays["tau"], row, rng)
+        np.savez(paths[0].parent / name, **arrays)  # pyright: ignore[reportArgumentType]
+    found, clean = (fj.identify_task(load_task(path)) for path in paths)
+    told = " ".join(note for note in found.notes if "wild rows are left out" in note)
+    assert all(name in told for name in files), (SEED, found.notes)
+    assert not any("wild rows are left out" in note for note in clean.notes)
+    np.testing.assert_array_equal([one.value for one in found.base], [one.value for one in clean.base])
+
+
+def test_predictions_are_on_all_stamps_of_the_file(tmp_path: Path):
+    case = make_case([], robot="small", repeats=1, trajectories=2, seed=SEED)
+    path = case.write(tmp_path)
+    written = json.loads(path.read_text())
+    written["data"][1]["role"] = "holdout"
+    path.write_text(json.dumps(written))
+    file = tmp_path / written["data"][1]["file"]
+    arrays = dict(np.load(file))
+    arrays["q"][500] += 2.5
+    np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
+    out = tmp_path / "run"
+    assert main(["identify", str(path), "--out", str(out), "--quiet"]) == 0
+    told = np.load(out / "predictions.npz")
+    np.testing.assert_allclose(told[f"{file.stem}_time"], arrays["t"], rtol=0, atol=1e-9)
+    left = told[f"{file.stem}_torque"] - arrays["tau"]
+    assert np.abs(left[490:511]).max() < 1.2 * np.abs(left).max() and np.isfinite(left).all()
+    assert np.sqrt(np.mean(left**2)) < 0.1 * np.sqrt(np.mean(arrays["tau"] ** 2))
+
+
+def test_a_rollout_keeps_its_rows_and_commands(tmp_path: Path):
+    """Wild positions count for nothing, and the command there stands; through a lost packet it holds."""
+    path = rollout_task(tmp_path, "none")
+    arrays = dict(np.load(tmp_path / "seen.npz"))
+    spoilt = {key: values.copy() for key, values in arrays.items()}
+    spoilt["q"][300] += 2.0
+    np.savez(tmp_path / "seen.npz", **spoilt)  # pyright: ignore[reportArgumentType]
+    _, (run, other), notes = read_rollouts(load_task(path))
+    assert other.trusted is None and run.trusted is not None
+    assert np.flatnonzero(~run.trusted).tolist() == [300] and len(run.time) == len(arrays["t"])
+    np.testing.assert_array_equal(run.command.ravel(), arrays["u"].ravel())
+    halfway = arrays["q"][[299, 301]].mean()
+    assert float(run.position[300, 0]) == pytest.approx(float(halfway), rel=0, abs=1e-12)
+    assert any("1 wild row is left out" in note for note in notes)
+
+
+def test_the_command_holds_through_a_lost_packet(run: tuple[RobotModel, Recording]):
+    robot, one = run
+    rows, ramp = drawn(one), np.tile(np.arange(len(one.time), dtype=float)[:, None], one.position.shape[1])
+    found = bridged(replace(spoiled(one, "lost", rows), command=ramp), robot)
+    assert found.command is not None and found.trusted is not None
+    np.testing.assert_array_equal(found.command[rows], ramp[rows - 1])
+    np.testing.assert_array_equal(np.flatnonzero(~found.trusted.any(axis=1)), rows)
+    np.testing.assert_allclose(found.position[rows], (one.position[rows - 1] + one.position[rows + 1]) / 2, atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", FOUND)
+def test_a_real_robot_is_told_the_same_of(kind: str, data_dir: Path):
+    """A UR10e with eight wild rows in each of three recordings: of ten causes four, seven and one were left before."""
+    from benchmarks.wild_rows import answered
+
+    clean, found = (answered("ur10e", what, MANY, SEED) for what in ("none", kind))
+    names, told = ({(c["effect"], *c["at"]) for c in one["causes"]} for one in (clean, found))
+    assert told == names, (SEED, told ^ names)
+    assert found["holdout"]["after"] < 1.02 * clean["holdout"]["after"], SEED
+
+
+@pytest.mark.slow
+def test_recordings_of_real_robots_have_no_wild_rows(data_dir: Path, tmp_path: Path):
+    from benchmarks.hide_in_real.recordings import SETS
+
+    for name, real in SETS.items():
+        made = real()
+        (tmp_path / f"{name}.urdf").write_text(made.urdf)
+        robot = fj.load_urdf(tmp_path / f"{name}.urdf", joints=list(made.joints))
+        for one in made.recordings:
+            read = Recording(one.name, Path(one.name), robot.dof_names, one.time, one.position, torque=one.torque)
+            assert without_wild_rows(read, robot) is read, (name, one.name)
