@@ -1,8 +1,8 @@
-"""Rows that no robot made, as logs have them: wild samples and lost packets. They are found, told and left out.
+"""Rows that no robot made, as logs have them: wild samples, lost packets, streams that stood still.
 
-A low pass spreads a wild position over all rows within half a period of its cutoff, where its acceleration is that of
-no motion: eight of 3000 rows move every number of a fit. Without them the stamps have a gap of a row, which an even
-grid bridges.
+They are found, told and left out. A low pass spreads a wild position over all rows within half a period of its cutoff,
+where its acceleration is that of no motion: eight of 3000 rows move every number of a fit. Without them the stamps have
+gaps: short ones are bridged, and rows near long ones count for nothing.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ __all__ = [
     "limits",
     "lost_rows",
     "pulses",
+    "stopped_rows",
     "wild_rows",
     "wild_steps",
     "wild_torque",
@@ -38,6 +39,10 @@ ASIDE = 8.0  # times the usual step: how far it does at the least
 BACK = 0.25  # of how far a sample stands aside: what the rows before and after it may differ by
 OF_RANGE = 2.0  # of the range of a torque: stops of a real arm, of one row at 100 Hz, stand .7 to 1.1 aside
 SOUND = 10  # rows of a stretch that belongs to the motion
+STOPPED = 0.2  # of the rows: where more repeat the row before, the log is faster than its stream
+REPEATS = 5  # rows: a stream that repeats fewer has not stopped
+MOVED_ON = 4.0  # usual steps that the motion has made meanwhile, in one joint at least
+SUDDEN = 3.0  # times the steps before and after it: the step with which a stream goes on
 
 Rows = Bool[np.ndarray, " rows"]
 Mask = Bool[np.ndarray, "rows nv"]
@@ -106,13 +111,15 @@ def wild_rows(recording: Recording, model: RobotModel) -> Wild | None:
 
     These are positions to which a joint jumps and from which it comes back, or that the motion begins or ends with;
     torque of one to three rows that is twice its range aside from that around it, or far beyond the joint's limit; rows
-    of zeros in the middle of a motion. None too where they are more than 2 % of all, as where a joint jumps and does
-    not come back: something else is wrong then, which `check_recordings` tells.
+    of zeros in the middle of a motion; rows in which positions, or torques, of all joints repeat while the robot moves
+    on (`stopped_rows`). None too where the others are more than 2 % of all, as where a joint jumps and does not come
+    back: something else is wrong then, which `check_recordings` tells.
     """
     if model.nq != model.nv or len(recording.time) < FEWEST:
         return None
-    shape, rows = recording.position.shape, np.arange(len(recording.time))
-    moved, forced, lost = np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(len(rows), bool)
+    shape, stopped = recording.position.shape, stopped_rows(recording.position, recording.torque)
+    moved, forced, lost = np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(shape[0], bool)
+    rows = np.flatnonzero(~stopped)
     while True:  # many of them hide others: they are part of what is usual
         position, time = recording.position[rows], recording.time[rows]
         torque = None if recording.torque is None else recording.torque[rows]
@@ -127,8 +134,9 @@ def wild_rows(recording: Recording, model: RobotModel) -> Wild | None:
             return None
         if not wild[rows].any():
             break
-        rows = np.flatnonzero(~wild)
-    return Wild(wild, lost, _told(recording, model, moved, forced, lost)) if wild.any() else None
+        rows = np.flatnonzero(~wild & ~stopped)
+    wild |= stopped
+    return Wild(wild, lost, _told(recording, model, moved, forced, lost, stopped)) if wild.any() else None
 
 
 def limits(model: RobotModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -190,6 +198,33 @@ def pulses(torque: Float[np.ndarray, "rows nv"], ranges: float = 0.5) -> Mask:
     return _aside(torque, np.where(high > low, ranges * (high - low), np.inf))
 
 
+def stopped_rows(position: Float[np.ndarray, "rows nv"], torque: Float[np.ndarray, "rows nv"] | None) -> Rows:
+    """Rows that repeat, bit by bit and at every joint, the one before them while the robot moves on.
+
+    Positions then go on with a step many times those around it; torques repeat while positions change. A robot that
+    stands still repeats its positions too, and starts slowly. Nothing is found in a log that repeats more than a fifth
+    of its rows: it samples a slower stream.
+    """
+    found = np.zeros(len(position), bool)
+    steps = np.diff(position, axis=0)
+    usual = _usual(steps)
+    for values in (position, torque):
+        if values is None:
+            continue
+        same = np.append(False, (np.diff(values, axis=0) == 0).all(axis=1))
+        edges = np.flatnonzero(np.diff(np.append(same, False).astype(int)))
+        for begin, end in zip(edges[::2] + 1, edges[1::2] + 1, strict=True):  # they repeat the row `begin` - 1
+            if end - begin < REPEATS or begin < 2 or end > len(position) - 2:
+                continue
+            if values is position:
+                step, beside = np.abs(steps[end - 1]), np.abs(steps[[begin - 2, end]]).max(axis=0)
+                on = (step > MOVED_ON * usual) & (step > SUDDEN * beside)
+            else:
+                on = np.abs(position[end - 1] - position[begin - 1]) > MOVED_ON * usual
+            found[begin:end] |= bool(on.any())
+    return found if found.mean() <= STOPPED else np.zeros_like(found)
+
+
 def _wild_positions(
     position: Float[np.ndarray, "rows nv"], time: Float[np.ndarray, " rows"], model: RobotModel
 ) -> Mask:
@@ -244,9 +279,9 @@ def _aside(values: Float[np.ndarray, "rows nv"], least: Float[np.ndarray, " nv"]
     return found
 
 
-def _told(recording: Recording, model: RobotModel, moved: Mask, forced: Mask, lost: Rows) -> str:
-    """How many rows are wild, and why: the largest jump, the largest torque, and packets that never came."""
-    many = int((lost | moved.any(axis=1) | forced.any(axis=1)).sum())
+def _told(recording: Recording, model: RobotModel, moved: Mask, forced: Mask, lost: Rows, stopped: Rows) -> str:
+    """How many rows are wild, and why: the largest jump, the largest torque, packets that never came, what repeats."""
+    many = int((lost | moved.any(axis=1) | forced.any(axis=1) | stopped).sum())
     moved, forced, slides, why = moved & ~lost[:, None], forced & ~lost[:, None], prismatic(model), []
 
     def largest(values: Float[np.ndarray, "rows nv"], which: Mask) -> tuple[int, int, str]:
@@ -265,4 +300,8 @@ def _told(recording: Recording, model: RobotModel, moved: Mask, forced: Mask, lo
         zero = np.flatnonzero(lost)
         others = f" and {len(zero) - 1} more" if len(zero) > 1 else ""
         why.append(f"zero at every joint in row {zero[0]}{others} (lost packets)")
+    if stopped.any():
+        begins = np.flatnonzero(np.diff(np.append(False, stopped).astype(int)) == 1)
+        others = f" and {len(begins) - 1} more" if len(begins) > 1 else ""
+        why.append(f"a stream stops in row {begins[0]}{others}: every joint reads the same while the robot moves on")
     return f"{many} wild row{' is' if many == 1 else 's are'} left out: {'; '.join(why)}, counted from 0"
