@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 __all__ = [
     "BoundedEstimate",
@@ -178,6 +178,7 @@ class Trace:
     before: Float[np.ndarray, "samples nv"]
     after: Float[np.ndarray, "samples nv"]
     shares: dict[str, Float[np.ndarray, "samples nv"]] = field(default_factory=dict)  # torque of each cause
+    counted: Bool[np.ndarray, "samples nv"] | None = None  # False: near a gap, or below a gate; None: all count
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -234,6 +234,7 @@ def traces(
                 before=before[here],
                 after=after[here],
                 shares={str(f.name): share[here] for f, share in zip(found, shares, strict=True)},
+                counted=np.asarray(one.rows.weight) > 0,
             )
         )
     return tuple(out)

@@ -39,9 +39,10 @@ def holdout(diagnosis: Diagnosis) -> dict[str, Any]:
     held = [trace for trace in diagnosis.traces if trace.role == "holdout" and trace.measured is not None]
     gain, joints = diagnosis.holdout, {}
     for j, name in enumerate(diagnosis.joints if held else ()):
-        measured = np.concatenate([np.asarray(trace.measured)[:, j] for trace in held])
-        after = np.concatenate([np.asarray(trace.after)[:, j] for trace in held])
-        size = float(np.sqrt(np.mean(measured**2)))
+        rows = [slice(None) if trace.counted is None else trace.counted[:, j] for trace in held]
+        measured = np.concatenate([np.asarray(trace.measured)[at, j] for trace, at in zip(held, rows, strict=True)])
+        after = np.concatenate([np.asarray(trace.after)[at, j] for trace, at in zip(held, rows, strict=True)])
+        size = float(np.sqrt(np.mean(measured**2))) if len(measured) else 0.0
         joints[name] = finite(np.sqrt(np.mean((measured - after) ** 2)) / size) if size > 0 else None
     return {"before": finite(gain.before), "after": finite(gain.after), "unit": gain.unit, "joints": joints}
 
