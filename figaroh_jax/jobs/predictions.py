@@ -37,6 +37,8 @@ def predictions(
                 torque = predict(loaded, motion.time, *state, motion.dt)
             else:
                 torque = loaded.inverse_dynamics(*state)
-            stamps = recording.time if recording.stamps is None else recording.stamps
-            found[recording.name] = stamps, to_recording_times(motion.time, np.asarray(torque), stamps)
+            stamps, clock = recording.stamps, recording.clock
+            if stamps is None or clock is None:
+                stamps = clock = recording.time
+            found[recording.name] = stamps, to_recording_times(motion.time, np.asarray(torque), clock)
     return found

@@ -71,7 +71,8 @@ class Recording:
     role: Literal["fit", "holdout"] = "fit"
     notes: tuple[str, ...] = ()
     trusted: Bool[np.ndarray, "samples nv"] | None = None  # False: torque that counts for nothing (see `cleaning`)
-    stamps: Float[np.ndarray, " all"] | None = None  # s, of all rows of the file, where some are left out
+    stamps: Float[np.ndarray, " all"] | None = None  # s, of all rows of the file, where some are left out or lack
+    clock: Float[np.ndarray, " all"] | None = None  # s, when these rows were: the same but where rows lack
     wild: str = ""  # which rows no robot made, and what was done (see `wild`)
 
 

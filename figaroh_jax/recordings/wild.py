@@ -1,8 +1,8 @@
-"""Rows that no robot made, as logs have them: wild samples, lost packets, streams that stood still.
+"""Rows that no robot made, as logs have them: wild samples, lost packets, streams that stood still, rows that lack.
 
-They are found, told and left out. A low pass spreads a wild position over all rows within half a period of its cutoff,
-where its acceleration is that of no motion: eight of 3000 rows move every number of a fit. Without them the stamps have
-gaps: short ones are bridged, and rows near long ones count for nothing.
+They are found, told and left out, or given their time. A low pass spreads a wild position over all rows within half a
+period of its cutoff, where its acceleration is that of no motion: eight of 3000 rows move every number of a fit.
+Without them the stamps have gaps: short ones are bridged, and rows near long ones count for nothing.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ __all__ = [
     "bridged",
     "limits",
     "lost_rows",
+    "lost_time",
     "pulses",
     "stopped_rows",
     "wild_rows",
@@ -35,14 +36,18 @@ FEWEST = 50  # rows from which it is known what is usual
 MOST = 0.02  # of the rows: where more are wild, something else is wrong, and all of them stay
 BEYOND = 20.0  # times the usual step of a joint (98 % are smaller): no motion goes as far from one row to the next
 SHORT = 3  # rows for which a sample stands aside at the most
-ASIDE = 8.0  # times the usual step: how far it does at the least
+ASIDE = 10.0  # times the steps that 95 % are below: how far it does at the least
 BACK = 0.25  # of how far a sample stands aside: what the rows before and after it may differ by
 OF_RANGE = 2.0  # of the range of a torque: stops of a real arm, of one row at 100 Hz, stand .7 to 1.1 aside
 SOUND = 10  # rows of a stretch that belongs to the motion
 STOPPED = 0.2  # of the rows: where more repeat the row before, the log is faster than its stream
-REPEATS = 5  # rows: a stream that repeats fewer has not stopped
+REPEATS = 3  # rows: a stream that repeats fewer has not stopped
 MOVED_ON = 4.0  # usual steps that the motion has made meanwhile, in one joint at least
 SUDDEN = 3.0  # times the steps before and after it: the step with which a stream goes on
+AROUND = 3  # steps before and after rows that lack, which tell how fast the joints were
+ALONG = 0.3  # of such a step: what of it may not be along the motion of the joints
+STANDS = 0.05  # of the fastest joint's usual step: a joint with less stands still
+LONGEST = 0.5  # s: over more than that no motion goes on as it was
 
 Rows = Bool[np.ndarray, " rows"]
 Mask = Bool[np.ndarray, "rows nv"]
@@ -59,7 +64,8 @@ class Wild(NamedTuple):
 def without_wild_rows(recording: Recording, model: RobotModel) -> Recording:
     """The recording (joint side) without rows that no robot made: `wild` says which, `stamps` are all that it had.
 
-    They are those of `wild_rows`; where it finds none, the recording is given back as it is.
+    They are those of `wild_rows`; stamps that run on evenly over rows that lack are moved first (`lost_time`: `clock`
+    are all stamps then). Where nothing is found, the recording is given back as it is.
 
     >>> import numpy as np, figaroh_jax as fj
     >>> t = np.arange(500)[:, None] / 250.0
@@ -70,12 +76,19 @@ def without_wild_rows(recording: Recording, model: RobotModel) -> Recording:
     >>> len(found.time), found.wild
     (499, '1 wild row is left out: position of joint 3 jumps by 0.9985 rad in row 100, counted from 0')
     """
+    clock, lacking = recording.time, ""
+    if model.nq == model.nv and len(clock) >= FEWEST:
+        clock, lacking = lost_time(recording.position, clock)
+    stamps = recording.time
+    if lacking:
+        recording = replace(recording, time=clock, stamps=stamps, clock=clock, wild=lacking)
     found = wild_rows(recording, model)
     if found is None:
         return recording
     series = {key: getattr(recording, key) for key in ("time", "position", "velocity", "torque", "command", "trusted")}
     shorter = {key: values[~found.rows] for key, values in series.items() if values is not None}
-    return replace(recording, **shorter, stamps=recording.time, wild=found.text)
+    text = f"{found.text}; {lacking}" if lacking else found.text
+    return replace(recording, **shorter, stamps=stamps, clock=clock, wild=text)
 
 
 def bridged(recording: Recording, model: RobotModel) -> Recording:
@@ -193,8 +206,8 @@ def wild_torque(torque: Float[np.ndarray, "rows nv"], model: RobotModel) -> Mask
 
 
 def pulses(torque: Float[np.ndarray, "rows nv"], ranges: float = 0.5) -> Mask:
-    """Torque of one to three rows that stands aside from that around it by so many of its ranges (of 98 % of it)."""
-    low, high = np.percentile(torque, [1, 99], axis=0)
+    """Torque of one to three rows that stands aside from that around it by so many of its ranges (of 94 % of it)."""
+    low, high = np.percentile(torque, [3, 97], axis=0)
     return _aside(torque, np.where(high > low, ranges * (high - low), np.inf))
 
 
@@ -223,6 +236,43 @@ def stopped_rows(position: Float[np.ndarray, "rows nv"], torque: Float[np.ndarra
                 on = np.abs(position[end - 1] - position[begin - 1]) > MOVED_ON * usual
             found[begin:end] |= bool(on.any())
     return found if found.mean() <= STOPPED else np.zeros_like(found)
+
+
+def lost_time(
+    position: Float[np.ndarray, "rows nv"], time: Float[np.ndarray, " rows"]
+) -> tuple[Float[np.ndarray, " rows"], str]:
+    """Stamps (s) with the time of rows that lack under even stamps, and what is said of it (empty: none lack).
+
+    All joints then go on at once with a step many times those around it and along their motion, m times as large: m - 1
+    rows are lost. At least two joints must move, or one joint's encoder may have slipped.
+    """
+    from scipy.ndimage import maximum_filter1d
+
+    steps, dt = np.diff(position, axis=0), np.diff(time)
+    period, usual, size = float(np.median(dt)), _usual(steps), np.abs(steps)
+    usual = np.maximum(usual, STANDS * usual.max())
+    even = maximum_filter1d(dt, 2 * AROUND + 1, mode="nearest") < 1.5 * period  # where stamps have a gap, it is theirs
+    beside = np.maximum(np.roll(size, 1, axis=0), np.roll(size, -1, axis=0))
+    sudden = ((size > MOVED_ON * usual) & (size > SUDDEN * beside)).any(axis=1) & even
+    moved, places = np.zeros(len(dt)), []
+    for k in np.flatnonzero(sudden[AROUND : len(dt) - AROUND]) + AROUND:
+        if not size[k - AROUND : k].any(axis=1).all():
+            continue  # the stream stood still before it: no row is lost
+        rate = (steps[k - AROUND : k].mean(axis=0) + steps[k + 1 : k + 1 + AROUND].mean(axis=0)) / 2 / usual
+        step = steps[k] / usual
+        times = float(step @ rate / max(rate @ rate, 1e-300))
+        along = np.linalg.norm(step - times * rate) < ALONG * np.linalg.norm(step)
+        if along and SUDDEN < times < LONGEST / period and (np.abs(rate) > 0.1).sum() > 1:
+            moved[k] = (times - 1) * period
+            places.append(k + 1)
+    if not places or len(places) > MOST * len(time):
+        return time, ""
+    others = f" and {len(places) - 1} more" if len(places) > 1 else ""
+    seconds = float(moved.max())
+    text = (
+        f"rows lack before row {places[0]} (from 0){others}, up to {seconds:.2g} s each: all joints go on by many steps"
+    )
+    return time + np.append(0.0, np.cumsum(moved)), f"{text} at once; the stamps after them are moved by that time"
 
 
 def _wild_positions(
@@ -266,7 +316,7 @@ def _between_jumps(
 
 def _aside(values: Float[np.ndarray, "rows nv"], least: Float[np.ndarray, " nv"]) -> Mask:
     """Samples, up to three in a row, that are far from those before and after them, which agree with each other."""
-    least = np.maximum(least, ASIDE * _usual(np.diff(values, axis=0)))
+    least = np.maximum(least, ASIDE * np.percentile(np.abs(np.diff(values, axis=0)), 95, axis=0))
     found = np.zeros(values.shape, bool)
     for many in range(1, SHORT + 1):
         before, after = values[: -many - 1], values[many + 1 :]
