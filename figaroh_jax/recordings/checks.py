@@ -308,6 +308,7 @@ def _jumps(look: Look) -> Iterator[Finding]:
             bool(beyond),
             f"position of {look.joints[j]} jumps by {steps[k - 1, j]:.4g} {unit_of(look, j)} in row {k} (from 0)"
             f"{and_more(rows)}: a wild sample or lost rows; delete these rows, or exclude them with preprocess.window",
+            grave=True,  # no fit follows it, and all of it is taken for noise or for an effect
         )
 
 
