@@ -39,12 +39,13 @@ SHORT = 3  # rows for which a sample stands aside at the most
 ASIDE = 10.0  # times the steps that 95 % are below: how far it does at the least
 BACK = 0.25  # of how far a sample stands aside: what the rows before and after it may differ by
 OF_RANGE = 2.0  # of the range of a torque: stops of a real arm, of one row at 100 Hz, stand .7 to 1.1 aside
+AS_BEFORE = 0.3  # of the speed before a pulse: a change by less is no stop
 SOUND = 10  # rows of a stretch that belongs to the motion
 STOPPED = 0.2  # of the rows: where more repeat the row before, the log is faster than its stream
 REPEATS = 3  # rows: a stream that repeats fewer has not stopped
 MOVED_ON = 4.0  # usual steps that the motion has made meanwhile, in one joint at least
 SUDDEN = 3.0  # times the steps before and after it: the step with which a stream goes on
-AROUND = 3  # steps before and after rows that lack, which tell how fast the joints were
+AROUND = 3  # steps before and after, which tell how fast the joints were
 ALONG = 0.3  # of such a step: what of it may not be along the motion of the joints
 STANDS = 0.05  # of the fastest joint's usual step: a joint with less stands still
 LONGEST = 0.5  # s: over more than that no motion goes on as it was
@@ -123,10 +124,11 @@ def wild_rows(recording: Recording, model: RobotModel) -> Wild | None:
     """Rows of a recording (joint side) that no robot made, or None where there are none that can be left out.
 
     These are positions to which a joint jumps and from which it comes back, or that the motion begins or ends with;
-    torque of one to three rows that is twice its range aside from that around it, or far beyond the joint's limit; rows
-    of zeros in the middle of a motion; rows in which positions, or torques, of all joints repeat while the robot moves
-    on (`stopped_rows`). None too where the others are more than 2 % of all, as where a joint jumps and does not come
-    back: something else is wrong then, which `check_recordings` tells.
+    torque of one to three rows that stands aside from that around it by twice its range, or by half of it where the
+    motion goes on as before, or far beyond the joint's limit; rows of zeros in the middle of a motion; rows in which
+    positions, or torques, of all joints repeat while the robot moves on (`stopped_rows`). None too where the others are
+    more than 2 % of all, as where a joint jumps and does not come back: something else is wrong then, which
+    `check_recordings` tells.
     """
     if model.nq != model.nv or len(recording.time) < FEWEST:
         return None
@@ -138,8 +140,10 @@ def wild_rows(recording: Recording, model: RobotModel) -> Wild | None:
         torque = None if recording.torque is None else recording.torque[rows]
         moved[rows] |= _wild_positions(position, time, model)
         if torque is not None:
-            forced[rows] |= wild_torque(torque, model) | pulses(torque, OF_RANGE)
-        for values in (position, torque, None if torque is None else np.hstack([position, torque])):
+            alone = pulses(torque) & _goes_on(position)[:, None]
+            forced[rows] |= wild_torque(torque, model) | pulses(torque, OF_RANGE) | alone
+        both = np.hstack([position, torque]) if torque is not None and shape[1] == 1 else None
+        for values in (position, torque, both):
             if values is not None and values.shape[1] > 1 and values.any():
                 lost[rows[lost_rows(values)]] = True
         wild = lost | moved.any(axis=1) | forced.any(axis=1)
@@ -209,6 +213,18 @@ def pulses(torque: Float[np.ndarray, "rows nv"], ranges: float = 0.5) -> Mask:
     """Torque of one to three rows that stands aside from that around it by so many of its ranges (of 94 % of it)."""
     low, high = np.percentile(torque, [3, 97], axis=0)
     return _aside(torque, np.where(high > low, ranges * (high - low), np.inf))
+
+
+def _goes_on(position: Float[np.ndarray, "rows nv"]) -> Rows:
+    """Rows about which the robot moves, after them as fast as before: no torque there has stopped or started it."""
+    steps = np.diff(position, axis=0)
+    speed = np.cumsum(np.vstack([np.zeros_like(steps[:1]), steps / _usual(steps)]), axis=0)  # in usual steps
+    found, reach = np.zeros(len(position), bool), SHORT - 1 + AROUND
+    rows = np.arange(reach, len(position) - reach)
+    before, after = speed[rows - SHORT + 1] - speed[rows - reach], speed[rows + reach] - speed[rows + SHORT - 1]
+    change, was = np.linalg.norm(after - before, axis=1), np.linalg.norm(before, axis=1)
+    found[rows] = (change < AS_BEFORE * was) & (was > AROUND * AS_BEFORE)
+    return found
 
 
 def stopped_rows(position: Float[np.ndarray, "rows nv"], torque: Float[np.ndarray, "rows nv"] | None) -> Rows:
@@ -316,16 +332,16 @@ def _between_jumps(
 
 def _aside(values: Float[np.ndarray, "rows nv"], least: Float[np.ndarray, " nv"]) -> Mask:
     """Samples, up to three in a row, that are far from those before and after them, which agree with each other."""
-    least = np.maximum(least, ASIDE * np.percentile(np.abs(np.diff(values, axis=0)), 95, axis=0))
     found = np.zeros(values.shape, bool)
-    for many in range(1, SHORT + 1):
-        before, after = values[: -many - 1], values[many + 1 :]
-        rows = len(before)
-        between = [np.abs(values[1 + k : 1 + k + rows] - (before + after) / 2) for k in range(many)]
-        away = np.min(between, axis=0)
-        aside = (away > least) & (np.abs(after - before) < BACK * away)
-        for k in range(many):
-            found[1 + k : 1 + k + rows] |= aside
+    for x, own, limit in zip(values.T, found.T, least, strict=True):  # one by one: recordings may be large
+        far = max(limit, ASIDE * np.percentile(np.abs(np.diff(x)), 95))
+        for many in range(1, SHORT + 1):
+            before, after = x[: -many - 1], x[many + 1 :]
+            between, rows = (before + after) / 2, len(before)
+            away = np.min([np.abs(x[1 + k : 1 + k + rows] - between) for k in range(many)], axis=0)
+            aside = (away > far) & (np.abs(after - before) < BACK * away)
+            for k in range(many):
+                own[1 + k : 1 + k + rows] |= aside
     return found
 
 
