@@ -132,6 +132,22 @@ def test_a_pulse_of_the_torque_is_left_out_where_the_motion_goes_on(run: tuple[R
         assert "1 wild row is left out" in told and f"in row {fast}" in told, (SEED, told)
 
 
+def test_rows_are_told_as_the_file_counts_them(run: tuple[RobotModel, Recording]):
+    """Eight are left out before the one that is told."""
+    robot, one = run
+    rows = drawn(one)
+    stop = int(rows[-1]) + 20
+    wild = spoiled(one, "lost", rows)
+    assert wild.torque is not None
+    position, torque = wild.position.copy(), wild.torque.copy()
+    torque[stop, 1] += 1.2 * np.ptp(np.percentile(torque[:, 1], [1, 99]))
+    position[stop:] = position[stop]
+    found = without_wild_rows(replace(wild, position=position, torque=torque), robot)
+    assert len(found.time) == len(one.time) - MANY
+    (told,) = [text for text in check_recordings(None, robot, [found]) if "a sudden stop" in text]
+    assert f"in row {stop} " in told, (SEED, told)
+
+
 @pytest.mark.parametrize("kind", FOUND)
 def test_a_fit_is_that_of_the_recording_without_these_rows(kind: str, tmp_path: Path):
     case = make_case([], robot="small", repeats=1, trajectories=2, seed=SEED)

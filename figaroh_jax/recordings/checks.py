@@ -296,8 +296,8 @@ def _jumps(look: Look) -> Iterator[Finding]:
         if turns[j] and (np.abs(np.abs(biggest) - 2 * np.pi) < 0.3).all():
             yield Finding(
                 True,
-                f"position of {look.joints[j]} jumps by 2 pi in row {rows[0]}{and_more(rows)}: the encoder wraps"
-                " around; unwrap it (numpy.unwrap)",
+                f"position of {look.joints[j]} jumps by 2 pi in row {look.row(rows[0])}{and_more(rows)}: the encoder"
+                " wraps around; unwrap it (numpy.unwrap)",
             )
             continue
         k = rows[int(np.argmax(np.abs(biggest)))]
@@ -306,8 +306,9 @@ def _jumps(look: Look) -> Iterator[Finding]:
         beyond = max(low[j] - value, value - high[j]) > room or abs(steps[k - 1, j]) > 8 * np.pi
         yield Finding(
             bool(beyond),
-            f"position of {look.joints[j]} jumps by {steps[k - 1, j]:.4g} {unit_of(look, j)} in row {k} (from 0)"
-            f"{and_more(rows)}: a wild sample or lost rows; delete these rows, or exclude them with preprocess.window",
+            f"position of {look.joints[j]} jumps by {steps[k - 1, j]:.4g} {unit_of(look, j)} in row {look.row(k)} (from"
+            f" 0){and_more(rows)}: a wild sample or lost rows; delete these rows, or exclude them with"
+            " preprocess.window",
             grave=True,  # no fit follows it, and all of it is taken for noise or for an effect
         )
 
@@ -338,7 +339,7 @@ def _zero_rows(look: Look) -> Iterator[Finding]:
         if len(rows := lost_rows(values)):
             yield Finding(
                 False,
-                f"{key} is zero at every joint in row {rows[0]} (from 0){and_more(rows)}: lost packets?"
+                f"{key} is zero at every joint in row {look.row(rows[0])} (from 0){and_more(rows)}: lost packets?"
                 " Delete these rows",
             )
 
@@ -499,8 +500,8 @@ def _torque_values(look: Look) -> Iterator[Finding]:
         rows = np.flatnonzero(samples[:, j])
         yield Finding(
             bool(top[j] > 1e3 * ceiling[j]),
-            f"torque of {look.joints[j]} reads {torque[rows[0], j]:.4g} {effort_unit(look, j)} in row {rows[0]} (from"
-            f" 0){and_more(rows)}, limit {ceiling[j]:.4g}: wild samples; delete these rows",
+            f"torque of {look.joints[j]} reads {torque[rows[0], j]:.4g} {effort_unit(look, j)} in row"
+            f" {look.row(rows[0])} (from 0){and_more(rows)}, limit {ceiling[j]:.4g}: wild samples; delete these rows",
         )
     yield from _pulse(look)
     high = (usual > SOFT * ceiling) & ~wild
@@ -526,7 +527,7 @@ def _pulse(look: Look) -> Iterator[Finding]:
     after = k + 1 + int(np.argmin(np.append(alone[k + 1 :, j], False)))
     yield Finding(
         False,
-        f"torque of {look.joints[j]} is {torque[k, j]:.4g} {effort_unit(look, int(j))} in row {k} (from 0),"
+        f"torque of {look.joints[j]} is {torque[k, j]:.4g} {effort_unit(look, int(j))} in row {look.row(k)} (from 0),"
         f" {torque[k - 1, j]:.4g} before and {torque[after, j]:.4g} after it"
         f"{and_more(np.flatnonzero(alone.any(axis=1)))}: a sudden stop, or wild samples, which are to be deleted",
     )

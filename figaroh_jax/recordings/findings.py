@@ -56,6 +56,11 @@ class Look:
         assert self.series is not None
         return self.series
 
+    def row(self, row: int | np.integer) -> int:
+        """The row of the file that is a row here: some may have been left out."""
+        clock = None if self.series is None else self.series.clock
+        return int(row) if clock is None else int(np.searchsorted(clock, self.recording.time[row]))
+
     @cached_property
     def span(self) -> Float[np.ndarray, " nv"]:
         """Range of each joint without its outermost per cent."""
