@@ -286,7 +286,7 @@ def test_a_real_robot_is_told_the_same_of(kind: str, data_dir: Path):
 
 @pytest.mark.slow
 def test_what_real_recordings_have_of_it(data_dir: Path, tmp_path: Path):
-    """Of 19 one robot's stream stops: four and three rows of the Panda's log repeat, and the next makes up for them."""
+    """In the Panda's alone a stream stops: three and four rows repeat, and the next step makes up for them."""
     from benchmarks.hide_in_real.recordings import SETS
 
     for name, real in SETS.items():
