@@ -88,9 +88,14 @@ def _for_a_while(
 
 def answered(name: str, kind: str, rows: int, seed: int, places: int = 3) -> dict[str, Any]:
     """The answer on one set spoiled in one way; empty where there is none."""
+    return answer_on(spoiled(SETS[name](), kind, rows, places, seed))
+
+
+def answer_on(real: RealSet) -> dict[str, Any]:
+    """What the command line answers on a set; empty where it does not."""
     with tempfile.TemporaryDirectory() as scratch:
         cases, runs = Path(scratch, "cases"), Path(scratch, "runs")
-        twin = twin_of(cases, spoiled(SETS[name](), kind, rows, places, seed))
+        twin = twin_of(cases, real)
         blackbox.run(cases, runs, {twin["name"]: twin}, blackbox.default_command(), 1, 3600, ["named"])
         return blackbox.read(runs / twin["name"] / "all") or {}
 
