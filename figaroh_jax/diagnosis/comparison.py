@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..estimation.rows import UNKNOWN, Prior, Rows
+from ..estimation.sparse_rows import dense, places, spans
 
 __all__ = [
     "FoldSums",
@@ -87,11 +88,16 @@ def fold_sums(rows: Rows, X: Float[np.ndarray, "nv T P"], y: Float[np.ndarray, "
     y = rows.y if y is None else y
     folds, P = rows.fold.max() + 1, X.shape[2]
     gram, moment, square = np.zeros((folds, P, P)), np.zeros((folds, P)), np.zeros(folds)
-    for fold, own in _stretches(rows):
-        for columns, target in zip(X[:, own], y[:, own], strict=True):
-            gram[fold] += columns.T @ columns
-            moment[fold] += columns.T @ target
-            square[fold] += target @ target
+    for columns, target, used in zip(X, y, spans(X), strict=True):
+        where = places(used)
+        G, m = np.zeros((folds, len(where), len(where))), np.zeros((folds, len(where)))
+        for fold, own in _stretches(rows):
+            few = dense(columns[own], used)
+            G[fold] += few.T @ few
+            m[fold] += few.T @ target[own]
+            square[fold] += target[own] @ target[own]
+        gram[:, where[:, None], where] += G
+        moment[:, where] += m
     return FoldSums(gram, moment, square)
 
 
@@ -112,14 +118,14 @@ def _predicted(
 ) -> Float[np.ndarray, "nv T 2"]:
     """What the coefficients of `each` fold's fit make of its rows (nothing of those in no fold), and the last of all.
 
-    Both at once: the columns are read from memory once.
+    All at once: the columns are read from memory once.
     """
-    out = np.zeros((*X.shape[:2], 2))
-    for fold, own in _runs(rows):
-        if fold < 0:
-            out[:, own, 1] = X[:, own] @ each[-1]
-        else:
-            np.matmul(X[:, own], each[[fold, -1]].T, out=out[:, own])
+    out, own = np.zeros((*X.shape[:2], 2)), np.maximum(rows.fold, 0)[:, None]
+    for joint, used in enumerate(spans(X)):
+        every = sum((X[joint, :, one] @ each.T[one] for one in used), np.zeros((X.shape[1], len(each))))
+        out[joint, :, 0] = np.take_along_axis(every, own, axis=1)[:, 0]
+        out[joint, :, 1] = every[:, -1]
+    out[:, rows.fold < 0, 0] = 0.0
     return out
 
 
@@ -128,11 +134,15 @@ def grown_sums(rows: Rows, known: FoldSums, more: Float[np.ndarray, "nv T k"]) -
     (folds, P), k = known.moment.shape, more.shape[2]
     gram, moment = np.zeros((folds, P + k, P + k)), np.zeros((folds, P + k))
     gram[:, :P, :P], moment[:, :P] = known.gram, known.moment
-    for fold, own in _stretches(rows):
-        for columns, others, target in zip(rows.X[:, own, :P], more[:, own], rows.y[:, own], strict=True):
-            gram[fold, :P, P:] += columns.T @ others
-            gram[fold, P:, P:] += others.T @ others
-            moment[fold, P:] += others.T @ target
+    for columns, others, target, used in zip(rows.X, more, rows.y, spans(rows.X), strict=True):
+        if not others.any():  # columns of a cause at other joints
+            continue
+        for fold, own in _stretches(rows):
+            for one in used:
+                first = slice(one.start, min(one.stop, P))
+                gram[fold, first, P:] += columns[own, first].T @ others[own]
+            gram[fold, P:, P:] += others[own].T @ others[own]
+            moment[fold, P:] += others[own].T @ target[own]
     gram[:, P:, :P] = np.swapaxes(gram[:, :P, P:], 1, 2)
     return FoldSums(gram, moment, known.square)
 
@@ -141,10 +151,12 @@ def prefix_sums(rows: Rows, gram: Float[np.ndarray, "folds P P"]) -> FoldSums:
     """The sums of the first columns of some rows, their products being known."""
     count = gram.shape[1]
     moment, square = np.zeros(gram.shape[:2]), np.zeros(len(gram))
-    for fold, own in _stretches(rows):
-        for columns, target in zip(rows.X[:, own, :count], rows.y[:, own], strict=True):
-            moment[fold] += columns.T @ target
-            square[fold] += target @ target
+    for columns, target, used in zip(rows.X, rows.y, spans(rows.X), strict=True):
+        for fold, own in _stretches(rows):
+            for one in used:
+                first = slice(one.start, min(one.stop, count))
+                moment[fold, first] += columns[own, first].T @ target[own]
+            square[fold] += target[own] @ target[own]
     return FoldSums(gram, moment, square)
 
 
@@ -158,7 +170,9 @@ def sums_of(rows: Rows, known: FoldSums, y: Float[np.ndarray, "nv T"]) -> FoldSu
     """The sums of the same columns with another torque `y`."""
     moment, square = np.zeros_like(known.moment), np.zeros_like(known.square)
     for fold, own in _stretches(rows):
-        moment[fold] += sum(target @ columns for columns, target in zip(rows.X[:, own], y[:, own], strict=True))
+        for columns, target, used in zip(rows.X[:, own], y[:, own], spans(rows.X), strict=True):
+            for one in used:
+                moment[fold, one] += target @ columns[:, one]
         square[fold] += (y[:, own] ** 2).sum()
     return FoldSums(known.gram, moment, square)
 
@@ -229,10 +243,12 @@ def judge_grown(rows: Rows, base: Ground, joints: Sequence[int], more: Float[np.
     """
     was, k, (folds, P) = base.verdicts, len(more), base.verdicts.folds.shape
     crossed, gram, moment = np.zeros((folds, P, k)), np.zeros((folds, k, k)), np.zeros((folds, k))
+    used = spans(rows.X)
     for fold, here in _stretches(rows):
         for one, joint in enumerate(joints):
             Z = more[:, one, here]
-            crossed[fold] += rows.X[joint, here].T @ Z.T
+            for own in used[joint]:
+                crossed[fold, own] += rows.X[joint, here, own].T @ Z.T
             gram[fold] += Z @ Z.T
             moment[fold] += Z @ rows.y[joint, here]
     shared, own, right = _without(crossed), _without(gram), _without(moment)[..., None]

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from ..effects.base import Effect, exact
 from ..estimation.priors import physical_body
 from ..estimation.rows import UNKNOWN, Rows
+from ..estimation.sparse_rows import pulled
 from ..recordings.stacked import filtered_rows
 from ..results import Name
 from .believed import believed
@@ -259,8 +260,7 @@ def _body_verdicts(
 
 def _information(rows: Rows, base: Ground, Z: Float[np.ndarray, "nv T k"]) -> Float[np.ndarray, "k k"]:
     """Z'Z with the current model projected out: the precision of the columns' coefficients."""
-    tall, X = Z.reshape(-1, Z.shape[2]), rows.X.reshape(-1, rows.X.shape[2])
-    cross = X.T @ tall
+    tall, cross = Z.reshape(-1, Z.shape[2]), pulled(rows.X, np.moveaxis(Z, 2, 0)).T
     return tall.T @ tall - cross.T @ base.inverse[-1] @ cross
 
 
@@ -293,8 +293,8 @@ def _position_contender(
     ((name, parameter),) = effect.parameters().items()
     change, slope = _shift(problem, state, effect, name, ready.whitening)
     for _ in range(TURNS):
-        missing, cross = rows.y - change, np.tensordot(slope, rows.X, 2)
-        theta = base.inverse[-1] @ (np.tensordot(missing, rows.X, 2) + prior.precision * prior.mean)
+        missing, cross = rows.y - change, pulled(rows.X, slope)
+        theta = base.inverse[-1] @ (pulled(rows.X, missing) + prior.precision * prior.mean)
         taken = base.inverse[-1] @ cross
         own = float((slope**2).sum() - cross @ taken) + UNKNOWN
         move = float((slope * missing).sum() - cross @ theta) / own

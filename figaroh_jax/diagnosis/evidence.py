@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..estimation.rows import Linear, Rows, block_sums, tall
+from ..estimation import sparse_rows
+from ..estimation.rows import Linear, Rows, block_sums, model_sums
 from .bank import Bank, Columns
 
 __all__ = [
@@ -105,7 +106,7 @@ def other_scores(
 ) -> Float[np.ndarray, "draws columns"]:
     """The scores that other residual rows would give: Zi'e - H'(Xi'e - the prior's rows), in their precision."""
     kind = residual.dtype
-    model = (residual * rows.paired.astype(kind)).reshape(len(residual), -1) @ tall(rows.Xi).astype(kind, copy=False)
+    model = sparse_rows.pulled(rows.Xi, residual * rows.paired.astype(kind))
     return pulled + ((prior - model) @ H).astype(kind)
 
 
@@ -113,8 +114,7 @@ def block_scores(
     rows: Rows, linear: Linear, stock: Bank, H: Float[np.ndarray, "P columns"]
 ) -> Float[np.ndarray, "blocks columns"]:
     """The scores' share of each block, then of each prior row; they sum to the scores."""
-    own = linear.residual * rows.paired
-    model = np.sum([block_sums(rows, r, x.T) for x, r in zip(rows.Xi, own, strict=True)], axis=0)
+    model = model_sums(rows, rows.Xi, linear.residual * rows.paired)
     total = np.zeros((stock.width, rows.block.max() + 1))
     for joint, columns, Zi in stock.blocks:
         total[columns] += block_sums(rows, linear.residual[joint], Zi)

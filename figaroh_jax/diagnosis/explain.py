@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ..estimation import sparse_rows
 from ..estimation.rows import Linear, Rows
 from ..results import Candidate
 from .screening import Shown
@@ -42,7 +43,7 @@ def _products(
     """Z Z' and Z X of the columns of all candidates, joint by joint: all columns in all rows would be large."""
     count = spans[-1].stop if spans else 0
     raw, ZX = np.zeros((count, count)), np.zeros((count, rows.X.shape[2]))
-    for joint, X in enumerate(rows.X):
+    for joint, (X, used) in enumerate(zip(rows.X, sparse_rows.spans(rows.X), strict=True)):
         there = [
             (one.Z[:, list(one.joints).index(joint)], own)
             for one, own in zip(found, spans, strict=True)
@@ -52,7 +53,8 @@ def _products(
             at = np.concatenate([np.arange(own.start, own.stop) for _, own in there])
             Z = np.concatenate([columns for columns, _ in there])
             raw[np.ix_(at, at)] += Z @ Z.T
-            ZX[at] += Z @ X
+            for one in used:
+                ZX[at, one] += Z @ X[:, one]
     return raw, ZX
 
 

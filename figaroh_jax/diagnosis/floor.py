@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float
 from ..effects.base import Effect
 from ..estimation import noise
 from ..estimation.noise import Spectrum
-from ..estimation.rows import Prior, Rows, fit, tall
+from ..estimation.rows import Prior, Rows, fit
+from ..estimation.sparse_rows import products, pulled, spans, squares, times
 from ..results import Name
 from .bank import Columns
 from .comparison import ground, judge_grown, t_value
@@ -132,7 +133,7 @@ def _alike(problem: Problem, state: State) -> tuple[Rows, Float[np.ndarray, " nv
     """Rows as they are, the RMS of what a fit with the joints weighted alike leaves of them, and rows a joint."""
     rows = plain_rows(problem, state)
     count = _rows_a_joint(rows)
-    rough = rows.y - rows.X @ _weighted(rows, state.prior, np.sqrt((rows.y**2).mean(1)))
+    rough = rows.y - times(rows.X, _weighted(rows, state.prior, np.sqrt((rows.y**2).mean(1))))
     return rows, np.sqrt((rough**2).sum(1) / count), count
 
 
@@ -149,9 +150,8 @@ def noise_rms(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, " nv"]:
 
 def _weighted(rows: Rows, prior: Prior, scale: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " P"]:
     """Coefficients with the joints weighted by `scale` (N m or N)."""
-    X = (rows.X / scale[:, None, None]).reshape(-1, rows.X.shape[-1])
-    y = (rows.y / scale[:, None]).reshape(-1)
-    return np.linalg.solve(X.T @ X + np.diag(prior.precision + 1e-12), X.T @ y + prior.precision * prior.mean)
+    G, b = squares(rows.X, scale**-2.0), pulled(rows.X, rows.y / scale[:, None] ** 2)
+    return np.linalg.solve(G + np.diag(prior.precision + 1e-12), b + prior.precision * prior.mean)
 
 
 def whitening_of(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, "F nv"]:
@@ -161,7 +161,7 @@ def whitening_of(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, "F n
 
 
 def _from_repeats(problem: Problem, rows: Rows, state: State, response: Float[np.ndarray, "F nv"]) -> Spectrum:
-    residual = rows.y - rows.X @ state.theta
+    residual = rows.y - times(rows.X, state.theta)
     other = _mean_of_partners(rows, residual)
     partners = np.maximum((rows.partner >= 0).sum(0), 1)
     difference = (residual - other) / np.sqrt(1 + 1 / partners)
@@ -190,25 +190,17 @@ def _from_rich_model(
     response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
     long, smooth = count >= ENOUGH or (richness == 1 and _resolved(problem)), count >= ENOUGH and richness > 1
     rich = _rich(problem, state, response, forbid, smooth, richness)
-    basis, theta = _projection(rich.rows)
-    residual = rich.rows.y - rich.rows.X @ theta
+    basis = _basis(rich.rows)
     if not long:
-        independent = count * problem.passed
-        degrees = independent - (basis.reshape(len(scale), -1, basis.shape[1]) ** 2).sum((1, 2))
+        independent, residual = count * problem.passed, basis.residual
+        degrees = independent - np.array([(basis.of(joint) ** 2).sum() for joint in range(len(scale))])
         degrees = np.maximum(degrees, independent / 4)
         squares = ((residual * scale[:, None]) ** 2).sum(1)
         return noise.white(squares / degrees, float(problem.records.rate) / 2, degrees)
     # what the same model leaves of whitened rows: slow noise there carries little through rows that are left out
-    response = whitening_of(problem, _fit(problem, residual, response, _taken(problem, basis)))
-    again = _behind(problem, rich, response)
-    basis, theta = _projection(again)
-    return _fit(problem, again.y - again.X @ theta, response, _taken(problem, basis))
-
-
-def _taken(problem: Problem, basis: Float[np.ndarray, "nvT columns"]) -> Float[np.ndarray, "n M nv columns"]:
-    """What a projection takes, by recording, row and joint."""
-    n, _, length, nv = problem.records.shape
-    return np.moveaxis(basis.reshape(nv, n, length, -1), 0, 2)
+    response = whitening_of(problem, _fit(problem, basis.residual, response, basis))
+    basis = _basis(_behind(problem, rich, response))
+    return _fit(problem, basis.residual, response, basis)
 
 
 class _Taken(NamedTuple):
@@ -262,7 +254,7 @@ def _rich(
     state = solved(state, fit(rows, state.prior).theta)
     groups = catalogue(problem, state, rows, response, forbid)
     groups += rich_families(problem, state, response, few=not smooth)
-    taken, prior, found, gram = [], state.prior, None, tall(rows.X).T @ tall(rows.X)
+    taken, prior, found, gram = [], state.prior, None, squares(rows.X)
     for _ in range(richness):
         found = screen(rows, fit(rows, prior, gram), groups, found)
         scores = found.scores
@@ -276,7 +268,7 @@ def _rich(
         kept = kept_columns(scores[best].root[point])
         more = _full(rows, groups[best].columns, point) @ kept
         X = np.concatenate([rows.X, more], axis=2)
-        gram = _grown_gram(gram, tall(X), tall(more))
+        gram = _grown_gram(gram, X, more)
         rows, prior = rows._replace(X=X, Xi=X), prior.extended(more.shape[2])
         effect = jax.tree.map(lambda x, p=point: x[p], groups[best].effect)  # None stays what it is
         taken.append(_Taken(groups[best].name, effect, kept))
@@ -284,10 +276,10 @@ def _rich(
 
 
 def _grown_gram(
-    gram: Float[np.ndarray, "P0 P0"], X: Float[np.ndarray, "nvT P"], more: Float[np.ndarray, "nvT k"]
+    gram: Float[np.ndarray, "P0 P0"], X: Float[np.ndarray, "nv T P"], more: Float[np.ndarray, "nv T k"]
 ) -> Float[np.ndarray, "P P"]:
     """X'X, of which that of the columns before the last, `more`, is known."""
-    cross, before = X.T @ more, len(gram)
+    cross, before = products(X, more), len(gram)
     return np.block([[gram, cross[:before]], [cross[:before].T, cross[before:]]])
 
 
@@ -313,30 +305,44 @@ def kept_columns(root: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k directi
     return root[np.abs(root).max(1) > 0].T
 
 
-def _projection(rows: Rows) -> tuple[Float[np.ndarray, "nvT columns"], Float[np.ndarray, " P"]]:
-    """Orthonormal basis of what the rows' columns span, and the coefficients that project the torque on it."""
-    X = rows.X.reshape(rows.y.size, -1)
-    scale = np.sqrt((X**2).sum(0))
-    seen = scale > COLUMN_CUT * scale.max()
-    X = X[:, seen] / scale[seen]
-    values, vectors = np.linalg.eigh(X.T @ X)
+class _Basis(NamedTuple):
+    """An orthonormal basis of what the columns of rows span, X times `directions`, and what it leaves of the torque."""
+
+    X: Float[np.ndarray, "nv T P"]
+    directions: Float[np.ndarray, "P basis"]
+    residual: Float[np.ndarray, "nv T"]
+
+    def of(self, joint: int, rows: slice = slice(None)) -> Float[np.ndarray, "rows basis"]:
+        """Its rows of one joint: those of all joints would be the largest thing in memory."""
+        return sum(
+            (self.X[joint, rows, own] @ self.directions[own] for own in spans(self.X)[joint]),
+            np.zeros((len(range(self.X.shape[1])[rows]), self.directions.shape[1])),
+        )
+
+
+def _basis(rows: Rows) -> _Basis:
+    """What the rows' columns span, without the directions that rounding leaves."""
+    gram = squares(rows.X)
+    scale = np.sqrt(np.diag(gram))
+    seen = np.flatnonzero(scale > COLUMN_CUT * scale.max())
+    values, vectors = np.linalg.eigh(gram[np.ix_(seen, seen)] / np.outer(scale[seen], scale[seen]))
     keep = values > RICH_CUT
-    directions = vectors[:, keep] / np.sqrt(values[keep])
-    basis, theta = X @ directions, np.zeros(len(scale))
-    theta[seen] = directions @ (basis.T @ rows.y.reshape(-1)) / scale[seen]
-    return basis, theta
+    directions = np.zeros((len(scale), int(keep.sum())))
+    directions[seen] = vectors[:, keep] / np.sqrt(values[keep]) / scale[seen, None]
+    theta = directions @ (directions.T @ pulled(rows.X, rows.y))
+    return _Basis(rows.X, directions, rows.y - times(rows.X, theta))
 
 
 def _fit(
     problem: Problem,
     rows: Float[np.ndarray, "nv T"],
     response: Float[np.ndarray, "F nv"],
-    taken: Float[np.ndarray, "n M nv k"] | None = None,
+    taken: _Basis | None = None,
     news: float = 1.0,
 ) -> Spectrum:
     """Spectrum of unwhitened noise rows, of which a share `news` is independent.
 
-    `taken` is an orthonormal basis of what a model has removed from them.
+    `taken` is what a model has removed from them.
     """
     records = problem.records
     n, _, count, nv = records.shape
@@ -356,7 +362,10 @@ def _fit(
         masks.append(series[inside] != 0)
         kept += len(used) * masks[-1].mean(0)
         if taken is not None:
-            left -= len(used) * _onto(frequency, own, noise.leverage(taken[at.slot][here][inside]))
+            first = at.slot * count + at.row
+            rows_here = slice(first + inside.start, first + inside.stop)
+            shares = [noise.leverage(taken.of(joint, rows_here)) for joint in range(nv)]
+            left -= len(used) * _onto(frequency, own, np.stack(shares, axis=1))
     sizes = [int(mask.any(1).sum()) for mask in masks]
     weights = sum(sizes)
     power, left, kept = power / weights, np.maximum((left + kept) / weights, 0.1), kept / weights

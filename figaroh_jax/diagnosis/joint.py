@@ -11,7 +11,8 @@ from jaxtyping import Float
 
 from ..effects.base import Effect, exact
 from ..effects.catalogue import CATALOGUE, find
-from ..estimation.rows import Rows, block_sums, tall
+from ..estimation.rows import Rows, block_sums, model_sums
+from ..estimation.sparse_rows import pulled, squares, times
 from ..results import Name
 from .comparison import fold_sums
 from .design import fitted_fields, kind, shapes, with_shape
@@ -175,7 +176,9 @@ def with_parts(problem: Problem, joint: Joint, whitening: Float[np.ndarray, "F n
     slopes = [slope for e in joint.causes for slope in torque_slopes(problem, state, e, whitening)]
     J = np.concatenate([rows.X, *(slope[..., None] for slope in slopes)], axis=2)
     shape = [float(getattr(e, n)) for e in joint.causes for n in shapes(type(e))]
-    sums = fold_sums(rows, J, rows.y - rows.X @ state.theta - J @ (fitted.value - np.append(state.theta, shape)))
+    sums = fold_sums(
+        rows, J, rows.y - times(rows.X, state.theta) - times(J, fitted.value - np.append(state.theta, shape))
+    )
     count = len(sums.gram)
     if count < 2:
         return joint
@@ -204,8 +207,7 @@ def with_rest(
     step, fitted = joint.step, joint.fitted
     slopes = [slope for e in joint.causes for slope in torque_slopes(problem, step.state, e, whitening)]
     J = np.concatenate([step.rows.X, *(slope[..., None] for slope in slopes)], axis=2)
-    gram = np.tensordot(J, J, ((0, 1), (0, 1)))
-    inverse = _inverse(gram + np.diag(np.append(step.state.prior.precision, np.zeros(len(slopes)))))
+    inverse = _inverse(squares(J) + np.diag(np.append(step.state.prior.precision, np.zeros(len(slopes)))))
     covariance = fitted.covariance.copy()
     for place, joints in zip(fitted.places, places, strict=True):
         at = np.ix_(place, place)
@@ -247,13 +249,12 @@ def joint_fit(problem: Problem, step: Step, causes: list[Effect], whitening: Flo
     each = [slope for e in causes for slope in torque_slopes(problem, state, e, whitening)]
     slopes = np.stack(each) if each else np.zeros((0, *rows.y.shape))
     precision = np.append(state.prior.precision, np.zeros(len(slopes)))
-    flat = slopes.reshape(len(slopes), rows.y.size)
-    cross = flat @ tall(rows.X)
+    flat, cross = slopes.reshape(len(slopes), rows.y.size), pulled(rows.X, slopes)
     A = np.block([[step.folded.gram.sum(0), cross.T], [cross, flat @ flat.T]]) + np.diag(precision)
     inverse = _inverse(A)
-    residual = rows.y - rows.X @ state.theta
+    residual = rows.y - times(rows.X, state.theta)
     pull = np.append(state.prior.precision * (state.prior.mean - state.theta), np.zeros(len(slopes)))
-    move = inverse @ (np.append(np.tensordot(residual, rows.X, 2), flat @ residual.reshape(-1)) + pull)
+    move = inverse @ (np.append(pulled(rows.X, residual), flat @ residual.reshape(-1)) + pull)
     values = [float(getattr(e, n)) for e in causes for n in shapes(type(e))]
     covariance = inverse @ (_scatter(rows, slopes, residual) + np.diag(precision)) @ inverse
     covariance = _widened(covariance, inverse, rows, residual, len(A))
@@ -288,11 +289,10 @@ def _scatter(
 ) -> Float[np.ndarray, "P P"]:
     """sum_b g_b g_b' of the blocks' scores g_b = J_b' r_b: right for coloured residuals too. J are X and the slopes."""
     blocks, touched = rows.block.max() + 1, np.flatnonzero(slopes.any((0, 2)))
-    linear = np.sum([block_sums(rows, r, x.T) for x, r in zip(rows.X, residual, strict=True)], axis=0)
     others = np.zeros((len(slopes), blocks))
     for joint in touched:
         others += block_sums(rows, residual[joint], slopes[:, joint])
-    scores = np.concatenate([linear, others])
+    scores = np.concatenate([model_sums(rows, rows.X, residual), others])
     return scores @ scores.T * blocks / max(blocks - 1, 1)
 
 

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float
 
 from ..estimation import noise
 from ..estimation.noise import Spectrum
-from ..estimation.rows import Linear, Rows, tall
+from ..estimation.rows import Linear, Rows
+from ..estimation.sparse_rows import pulled, times
 from ..recordings.stacked import filter_rows
 from ..results import Dependence, Part, Verdict
 from .comparison import ground, judge_grown, t_needed, t_value
@@ -152,8 +153,8 @@ def beyond_noise(
 
 def _left_of(noise: Float[np.ndarray, "draws nv T"], rows: Rows, linear: Linear) -> Float[np.ndarray, "draws nv T"]:
     """What a fit leaves of rows of noise."""
-    theta = (noise * rows.paired).reshape(len(noise), -1) @ tall(rows.Xi) @ linear.inverse.T
-    return noise - np.moveaxis(rows.X @ theta.T, 2, 0)
+    theta = pulled(rows.Xi, noise * rows.paired) @ linear.inverse.T
+    return noise - np.moveaxis(times(rows.X, theta.T), 2, 0)
 
 
 def repeating(

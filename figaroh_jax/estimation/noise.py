@@ -218,8 +218,8 @@ def whitening(
     return 1 / np.sqrt(filtered + floor)
 
 
-def leverage(basis: Float[np.ndarray, "samples nv columns"]) -> Float[np.ndarray, "freqs nv"]:
-    """Share of white noise that a projection on orthonormal `basis` takes away at each frequency, from 0, and joint."""
+def leverage(basis: Float[np.ndarray, "samples columns"]) -> Float[np.ndarray, " freqs"]:
+    """Share of white noise that a projection on orthonormal `basis` takes away at each frequency, from 0."""
     return (np.abs(np.fft.rfft(basis, axis=0)) ** 2).sum(-1) / basis.shape[0]
 
 

@@ -12,7 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-__all__ = ["Linear", "Prior", "Rows", "block_sums", "fit", "instruments", "tall"]
+from .sparse_rows import products, pulled, spans, squares, times
+
+__all__ = ["Linear", "Prior", "Rows", "block_sums", "fit", "instruments", "model_sums"]
 
 FEW = 50  # columns of which sums over blocks are quicker than a product for each block
 UNKNOWN = 1e-8  # precision of a coefficient of which nothing is known
@@ -66,13 +68,12 @@ def fit(rows: Rows, prior: Prior, gram: Float[np.ndarray, "P P"] | None = None) 
     `gram` is X'X where that is known.
     """
     repeats = bool(len(rows.partner))
-    Xi, y = tall(rows.Xi), (rows.y * rows.paired).reshape(-1)
-    cross = Xi.T @ tall(rows.X) if repeats or gram is None else gram
+    cross = products(rows.Xi, rows.X) if repeats or gram is None else gram
     A = (cross + cross.T) / 2 + np.diag(prior.precision)
     inverse = np.linalg.inv(_conditioned(A))
-    theta = inverse @ (Xi.T @ y + prior.precision * prior.mean)
-    moment = (Xi.T @ Xi if repeats else cross) + np.diag(prior.precision)
-    residual = rows.y - rows.X @ theta
+    theta = inverse @ (pulled(rows.Xi, rows.y * rows.paired) + prior.precision * prior.mean)
+    moment = (squares(rows.Xi) if repeats else cross) + np.diag(prior.precision)
+    residual = rows.y - times(rows.X, theta)
     return Linear(theta, inverse, residual, moment, prior.precision * (theta - prior.mean))
 
 
@@ -107,9 +108,15 @@ def block_sums(
     return out
 
 
-def tall(X: Float[np.ndarray, "nv T P"]) -> Float[np.ndarray, "nvT P"]:
-    """The rows of all joints, one joint behind the other."""
-    return X.reshape(-1, X.shape[-1])
+def model_sums(
+    rows: Rows, X: Float[np.ndarray, "nv T P"], residual: Float[np.ndarray, "nv T"]
+) -> Float[np.ndarray, "P blocks"]:
+    """`block_sums` of the residual and each column of the model, over the joints."""
+    out = np.zeros((X.shape[2], rows.block.max() + 1))
+    for columns, weight, own in zip(X, residual, spans(X), strict=True):
+        for one in own:
+            out[one] += block_sums(rows, weight, columns[:, one].T)
+    return out
 
 
 def _conditioned(A: Float[np.ndarray, "P P"]) -> Float[np.ndarray, "P P"]:
