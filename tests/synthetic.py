@@ -8,6 +8,7 @@ from typing import Literal
 import equinox as eqx
 import numpy as np
 
+from figaroh_jax.estimation.joint_rows import JointRows
 from figaroh_jax.estimation.rows import Rows
 from figaroh_jax.recordings.rowfilter import row_filter
 from figaroh_jax.recordings.signals import Signals
@@ -71,5 +72,6 @@ def made_rows(
     nv, count = y.shape
     place = np.arange(count)
     partner = np.roll(place, count // 2)[None] if repeats else np.zeros((0, count), int)
-    Xi = X[:, partner[0]] if repeats else X
-    return Rows(y, X, Xi, np.ones((nv, count)), partner, place * blocks // count, place * folds // count)
+    own = JointRows.of(X)
+    Xi = JointRows.of(X[:, partner[0]]) if repeats else own
+    return Rows(y, own, Xi, np.ones((nv, count)), partner, place * blocks // count, place * folds // count)

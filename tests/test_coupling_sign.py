@@ -11,6 +11,7 @@ from scipy.optimize import nnls
 
 from figaroh_jax.diagnosis import contenders
 from figaroh_jax.diagnosis.comparison import Hypothesis, fold_sums, ground, judge
+from figaroh_jax.estimation.joint_rows import JointRows
 from figaroh_jax.estimation.rows import Prior, Rows
 
 ROWS = 200
@@ -36,8 +37,7 @@ def test_of_two_mirrored_signs_the_one_with_positive_parts_comes_first(sign: flo
     noise = 0.1 * rng.standard_normal((2, ROWS))
     y = np.tensordot([0.5, 0.8, 0.3], own, 1) - 0.4 * grid[1 if sign > 0 else 0][2] + noise
     rows = _rows(y)
-    X = np.zeros((2, ROWS, 1))
-    X[:, :, 0] = 1.0
+    X = JointRows.of(np.ones((2, ROWS, 1)))
     rows = rows._replace(X=X)
     prior = Prior(np.zeros(1), np.zeros(1))
     sums = fold_sums(rows, X)
@@ -53,5 +53,5 @@ def test_of_two_mirrored_signs_the_one_with_positive_parts_comes_first(sign: flo
 
 def _rows(y: np.ndarray) -> Rows:
     block = np.arange(ROWS) // 10
-    empty = cast(Any, np.zeros((2, ROWS, 0)))
+    empty = cast(Any, JointRows.of(np.zeros((2, ROWS, 0))))
     return Rows(**{name: empty for name in Rows._fields} | {"y": y, "fold": block % 5, "block": block})

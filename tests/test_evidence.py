@@ -55,14 +55,16 @@ def own_scores(rows: Rows, linear: Linear, columns: Columns) -> np.ndarray:
 def test_fit_is_the_least_squares_solution_with_the_prior_as_rows() -> None:
     rows = random_rows()
     linear = fit(rows, PRIOR)
-    theta, _ = least_squares(rows.y, rows.X, PRIOR)
+    theta, _ = least_squares(rows.y, rows.X.dense(), PRIOR)
     np.testing.assert_allclose(linear.theta, theta, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(linear.residual, rows.y - rows.X @ theta, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(linear.residual, rows.y - rows.X.dense() @ theta, rtol=0, atol=1e-9)
 
 
 def test_a_column_that_nothing_excites_keeps_its_prior_value() -> None:
     rows = random_rows()
-    rows.X[:, :, 2] = 0.0
+    X = rows.X.dense()
+    X[:, :, 2] = 0.0
+    rows = made_rows(rows.y, X)
     prior = PRIOR._replace(mean=np.array([0.0, 0.0, 7.0, 0.0]))
     np.testing.assert_allclose(fit(rows, prior).theta[2], 7.0, rtol=0, atol=1e-9)
 
@@ -72,15 +74,15 @@ def test_score_is_the_drop_in_penalised_squares_when_the_columns_are_added(k: in
     rows, columns = random_rows(), random_columns(k, joints)
     linear, stock = fit(rows, PRIOR), bank(rows, [random_columns(2, (1,), seed=5), columns])
     found = evidence.scores(linear, stock, evidence.projection(linear, stock))[1]
-    _, before = least_squares(rows.y, rows.X, PRIOR)
-    drops = [before - least_squares(rows.y, rows.X, PRIOR, spread(columns, g))[1] for g in range(2)]
+    _, before = least_squares(rows.y, rows.X.dense(), PRIOR)
+    drops = [before - least_squares(rows.y, rows.X.dense(), PRIOR, spread(columns, g))[1] for g in range(2)]
     np.testing.assert_allclose(found.Q, drops, rtol=0, atol=1e-9)
     np.testing.assert_array_equal(found.rank, k)
 
 
 def test_a_candidate_inside_the_model_scores_nothing() -> None:
     rows, flat = random_rows(), Prior(np.zeros(WIDTH), np.zeros(WIDTH))
-    inside = Columns((0, 1), (rows.X @ [1.0, 2.0, -1.0, 0.5])[None, None])
+    inside = Columns((0, 1), (rows.X.dense() @ [1.0, 2.0, -1.0, 0.5])[None, None])
     linear, stock = fit(rows, flat), bank(rows, [inside])
     (found,) = evidence.scores(linear, stock, evidence.projection(linear, stock))
     assert found.rank[0] == 0
@@ -92,8 +94,8 @@ def test_columns_that_are_rounding_of_zero_count_as_no_direction() -> None:
     wider = Columns((0, 1), np.concatenate([columns.Z[:, :1], rounding, columns.Z[:, 1:]], axis=1))
     linear, stock = fit(rows, PRIOR), bank(rows, [wider])
     (found,) = evidence.scores(linear, stock, evidence.projection(linear, stock))
-    _, before = least_squares(rows.y, rows.X, PRIOR)
-    drops = [before - least_squares(rows.y, rows.X, PRIOR, spread(columns, g))[1] for g in range(2)]
+    _, before = least_squares(rows.y, rows.X.dense(), PRIOR)
+    drops = [before - least_squares(rows.y, rows.X.dense(), PRIOR, spread(columns, g))[1] for g in range(2)]
     np.testing.assert_array_equal(found.rank, 2)
     np.testing.assert_allclose(found.Q, drops, rtol=0, atol=1e-9)
 
@@ -223,7 +225,7 @@ def test_a_bank_beside_more_columns_is_the_bank_made_anew(repeats: bool) -> None
 def test_columns_that_the_model_has_already_do_not_come_in_again() -> None:
     rows, rng = random_rows(), np.random.default_rng(12)
     family = random_columns(3, grid=1, seed=13)
-    again = rows.X[:, :, 1] - 2 * rows.X[:, :, 3]  # what two columns of the model say, and rounding
+    again = rows.X.dense() @ [0.0, 1.0, 0.0, -2.0]  # what two columns of the model say, and rounding
     Z = np.concatenate([family.Z, (again + 1e-10 * rng.normal(size=again.shape))[None, None]], axis=1)
     own = Columns((0, 1), Z[:, rng.permutation(4)])
     weak = Prior(np.zeros(WIDTH), np.full(WIDTH, 1e-8))
@@ -232,7 +234,7 @@ def test_columns_that_the_model_has_already_do_not_come_in_again() -> None:
     (score,) = evidence.scores(linear, stock, evidence.projection(linear, stock))
     kept = spread(own, 0) @ kept_columns(score.root[0])
     assert kept.shape[1] == 3
-    X = rows.X.reshape(-1, WIDTH)
+    X = rows.X.dense().reshape(-1, WIDTH)
     left = kept - X @ np.linalg.lstsq(X, kept, rcond=None)[0]
     np.testing.assert_allclose(left.T @ left, np.eye(3), rtol=0, atol=1e-6)
     span = np.linalg.qr(np.hstack([X, spread(family, 0)]))[0]

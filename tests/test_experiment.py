@@ -45,9 +45,9 @@ def test_what_the_recordings_tell_is_what_least_squares_leave(setting: tuple[Pro
     problem, state, whitening = setting
     now, again, _ = _predicted(problem, state, friction(problem), [OTHER], whitening)
     rival = place(find(OTHER.effect), problem.model, OTHER.at)
-    X = whitened(problem, extended_state(problem, state, rival), whitening).X
+    X = whitened(problem, extended_state(problem, state, rival), whitening).X.dense()
     truth = extended_state(problem, state, friction(problem))
-    y = whitened(problem, truth, whitening).X[..., -1].reshape(-1) * 2.0
+    y = whitened(problem, truth, whitening).X.dense()[..., -1].reshape(-1) * 2.0
     sure = np.sqrt(np.append(state.prior.precision, 0.0))
     tall, right = np.concatenate([X.reshape(len(y), -1), np.diag(sure)]), np.append(y, np.zeros(len(sure)))
     left = right - tall @ np.linalg.lstsq(tall, right, rcond=None)[0]

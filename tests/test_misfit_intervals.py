@@ -13,6 +13,7 @@ from figaroh_jax.diagnosis.estimates import Fitted
 from figaroh_jax.diagnosis.joint import AS_SURE, Joint, least_sure, with_misfit, with_parts, with_rest
 from figaroh_jax.effects.base import Effect
 from figaroh_jax.effects.catalogue import find
+from figaroh_jax.estimation.joint_rows import JointRows
 from figaroh_jax.estimation.rows import Prior, Rows
 
 SHARE = 0.25  # correlation of the two values
@@ -90,7 +91,7 @@ def test_values_are_as_unsure_as_parts_of_the_data_disagree():
 
     each = np.stack([solution(part != k) for k in range(3)])
     jackknife = np.sqrt(2 / 3 * ((each - each.mean(0)) ** 2).sum(0))
-    rows = Rows(y, X, X, np.zeros((0, 60), int), np.ones((2, 60)), part, part)
+    rows = Rows(y, JointRows.of(X), JointRows.of(X), np.zeros((0, 60), int), np.ones((2, 60)), part, part)
     theta = solution(part >= 0)
     state = SimpleNamespace(theta=theta, prior=Prior(np.zeros(3), np.full(3, 1e-9)))
     step: Any = SimpleNamespace(rows=rows, state=state)
@@ -109,7 +110,7 @@ def test_a_value_that_one_part_alone_shows_is_as_sure_as_there():
     X[..., 1] *= part == 2
     y = X @ [1.0, 2.0] + 0.1 * rng.normal(size=(1, 80))
     theta = np.linalg.lstsq(X[0], y[0], rcond=None)[0]
-    rows = Rows(y, X, X, np.zeros((0, 80), int), np.ones((1, 80)), part, part)
+    rows = Rows(y, JointRows.of(X), JointRows.of(X), np.zeros((0, 80), int), np.ones((1, 80)), part, part)
     state = SimpleNamespace(theta=theta, prior=Prior(np.zeros(2), np.full(2, 1e-9)))
     step: Any = SimpleNamespace(rows=rows, state=state)
     covariance = 0.01 * np.linalg.inv(X[0].T @ X[0])
@@ -127,7 +128,7 @@ def test_values_are_as_unsure_as_what_is_left_at_their_joint(monkeypatch: pytest
     y = X[0] @ np.array([2.0, 5.0]) + 0.3 * signs @ functions
     theta, (squares,) = np.linalg.lstsq(X[0], y, rcond=None)[:2]
     step: Any = SimpleNamespace(
-        rows=SimpleNamespace(X=X), state=SimpleNamespace(prior=Prior(np.zeros(2), np.full(2, 1e-9)))
+        rows=SimpleNamespace(X=JointRows.of(X)), state=SimpleNamespace(prior=Prior(np.zeros(2), np.full(2, 1e-9)))
     )
     monkeypatch.setattr(fits, "torque_slopes", lambda *args: [])
     none: Any = None

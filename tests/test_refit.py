@@ -17,6 +17,7 @@ from figaroh_jax.diagnosis.refit import Whitened, box_minima, profile, refit, re
 from figaroh_jax.diagnosis.shifts import shifted, torque_change
 from figaroh_jax.effects.base import Effect, Motion
 from figaroh_jax.effects.catalogue import find
+from figaroh_jax.estimation.joint_rows import JointRows
 from figaroh_jax.recordings.stacked import Records, stack
 from figaroh_jax.rigid.dynamics import inverse_dynamics
 from figaroh_jax.rigid.model import RobotModel
@@ -50,7 +51,9 @@ def whitened(records: Records, residual: np.ndarray | None = None) -> Whitened:
     tall = X.reshape(-1, 3)
     inverse = np.linalg.inv(tall.T @ tall + np.diag([1.0, 10.0, 0.1]))
     residual = rng.standard_normal((nv, n, count)) if residual is None else residual
-    return Whitened(residual, X, inverse, np.ones((len(np.asarray(records.omega)), nv)))
+    return Whitened(
+        residual, JointRows.of(X.reshape(nv, n * count, 3)), inverse, np.ones((len(np.asarray(records.omega)), nv))
+    )
 
 
 def at_joint(name: str, *, joint: float = 0, **shape: float) -> Effect:
@@ -96,7 +99,7 @@ def test_profile_is_the_change_of_the_penalised_squares(motion: Motion, records:
     effect, rng = at_joint("torque_ripple", joint=1, order=6.0), np.random.default_rng(1)
     precision = np.array([1.0, 10.0, 0.1])
     rows = whitened(records)
-    X, y = np.asarray(rows.X).reshape(-1, 3), rng.standard_normal(np.asarray(rows.residual).size)
+    X, y = rows.X.dense().reshape(-1, 3), rng.standard_normal(np.asarray(rows.residual).size)
     root = np.diag(np.sqrt(precision))
     theta = np.linalg.lstsq(np.vstack([X, root]), np.append(y, np.zeros(3)), rcond=None)[0]
     residual = (y - X @ theta).reshape(np.asarray(rows.residual).shape)
@@ -135,7 +138,7 @@ def test_refit_finds_the_shape_that_made_noiseless_rows(
 
 def less_the_model(rows: Whitened, residual: np.ndarray) -> Whitened:
     """The rows with what the model leaves of a residual."""
-    X = rows.X.reshape(-1, rows.X.shape[-1])
+    X = rows.X.dense().reshape(-1, rows.X.width)
     taken = X @ rows.inverse @ (X.T @ residual.reshape(-1))
     return rows._replace(residual=residual - taken.reshape(residual.shape))
 

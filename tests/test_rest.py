@@ -29,6 +29,7 @@ from figaroh_jax.diagnosis.naming import (
 )
 from figaroh_jax.diagnosis.rest import repeated_power, repeating, significance, tolerated, verdict, wrong_law
 from figaroh_jax.effects.catalogue import find
+from figaroh_jax.estimation.joint_rows import JointRows
 from figaroh_jax.estimation.rows import Rows
 from figaroh_jax.results import Name
 
@@ -48,7 +49,7 @@ def test_noise_of_repeats_has_power_in_common_as_often_as_its_p_value_says(
     rng, count, draws = np.random.default_rng(), 400, 600
     row, shape = np.arange(repeats * count), (joints, repeats * count)
     partner = np.stack([(row + k * count) % (repeats * count) for k in range(1, repeats)])
-    blocks, none = row // 20, np.zeros((*shape, 0))
+    blocks, none = row // 20, JointRows.of(np.zeros((*shape, 0)))
     rows = Rows(np.ones(shape), none, none, np.ones(shape), partner, blocks, blocks)
     p = [repeated_power(rows, rng.standard_normal(shape))[1] for _ in range(draws)]
     share, deviation = float(np.mean(np.array(p) < 0.05)), np.sqrt(0.05 * 0.95 / draws)
@@ -200,8 +201,10 @@ def test_what_repeats_have_in_common_is_no_noise() -> None:
     residual = rng.standard_normal((2, 2 * n))
     residual[0] += np.tile(wave, 2)
     partner = np.concatenate([np.arange(n) + n, np.arange(n)])[None]
-    empty = np.zeros((2, 0, 0))
-    rows = Rows(empty, empty, empty, np.ones((2, 2 * n)), partner, np.zeros(2 * n, int), np.zeros(2 * n, int))
+    empty = JointRows.of(np.zeros((2, 0, 0)))
+    rows = Rows(
+        np.zeros((2, 0)), empty, empty, np.ones((2, 2 * n)), partner, np.zeros(2 * n, int), np.zeros(2 * n, int)
+    )
     counted = np.tile(np.arange(2 * n) % 3 == 0, (2, 1))
     problem = cast(Any, SimpleNamespace(layout=SimpleNamespace(repeats=True)))
     shared, none = repeating(problem, rows, residual, counted)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..estimation.joint_rows import JointRows
 from ..estimation.rows import Rows
 
 __all__ = ["Bank", "Columns", "bank"]
@@ -53,8 +54,8 @@ class Bank(NamedTuple):
         """Number of columns."""
         return max((first + grid * k for first, grid, k in self.span), default=0)
 
-    def product(self, rows: list[Float[np.ndarray, "T m"]]) -> Float[np.ndarray, "columns m"]:
-        """Every column times one matrix of rows a joint, summed over the joints."""
+    def product(self, rows: JointRows) -> Float[np.ndarray, "columns m"]:
+        """Every column times the rows of its joints, summed over them."""
         return _product(self.width, self.blocks, rows)
 
 
@@ -84,16 +85,16 @@ def bank(rows: Rows, candidates: list[Columns], before: Bank | None = None) -> B
             kept[first : first + size] = before.span[i][0] + np.arange(size)
     ZX = _grown_product(rows.X, blocks, kept, before.ZX if before else None)
     ZXi = _grown_product(rows.Xi, blocks, kept, before.ZXi if before else None) if len(rows.partner) else ZX
-    Zy = _grown_product(rows.y[..., None], blocks, kept, before.Zy[:, None] if before else None)[:, 0]
+    Zy = _grown_product(JointRows.of(rows.y[..., None]), blocks, kept, before.Zy[:, None] if before else None)[:, 0]
     return Bank(candidates, span, parts, blocks, own, ZX, ZXi, Zy)
 
 
 def _beside_more(rows: Rows, before: Bank) -> Bank:
     """The same bank beside a model with more columns."""
-    ZX = np.concatenate([before.ZX, before.product([x[:, before.ZX.shape[1] :] for x in rows.X])], axis=1)
+    ZX = np.concatenate([before.ZX, before.product(rows.X.after(before.ZX.shape[1]))], axis=1)
     if not len(rows.partner):
         return before._replace(ZX=ZX, ZXi=ZX)
-    more = before.product([x[:, before.ZXi.shape[1] :] for x in rows.Xi])
+    more = before.product(rows.Xi.after(before.ZXi.shape[1]))
     return before._replace(ZX=ZX, ZXi=np.concatenate([before.ZXi, more], axis=1))
 
 
@@ -127,18 +128,18 @@ def _parts(rows: Rows, one: Columns) -> list[Float[np.ndarray, "columns T"]]:
 
 
 def _grown_product(
-    X: Float[np.ndarray, "nv T P"],
+    X: JointRows,
     blocks: list[Block],
     kept: Int[np.ndarray, " width"],
     known: Float[np.ndarray, "before P0"] | None,
 ) -> Float[np.ndarray, "width P"]:
     """Zi'X, of which the first columns are `known` where `kept` names a row of them."""
     if known is None:
-        return _product(len(kept), blocks, list(X))
+        return _product(len(kept), blocks, X)
     P, same = known.shape[1], kept >= 0
-    out = np.zeros((len(kept), X.shape[2]))
-    out[:, P:] = _product(len(kept), blocks, [x[:, P:] for x in X])
-    out[:, :P] = _product(len(kept), [_fresh(block, ~same[block.columns]) for block in blocks], [x[:, :P] for x in X])
+    out = np.zeros((len(kept), X.width))
+    out[:, P:] = _product(len(kept), blocks, X.after(P))
+    out[:, :P] = _product(len(kept), [_fresh(block, ~same[block.columns]) for block in blocks], X.first(P))
     out[same, :P] = known[kept[same]]
     return out
 
@@ -147,20 +148,19 @@ def _fresh(block: Block, new: Bool[np.ndarray, " columns"]) -> Block:
     return block if new.all() else Block(block.joint, block.columns[new], block.Zi[new])
 
 
-def _product(width: int, blocks: list[Block], rows: list[Float[np.ndarray, "T m"]]) -> Float[np.ndarray, "columns m"]:
-    out = np.zeros((width, rows[0].shape[1]))
+def _product(width: int, blocks: list[Block], rows: JointRows) -> Float[np.ndarray, "columns m"]:
+    out = np.zeros((width, rows.width))
     for joint in sorted({block.joint for block in blocks}):
         beside = [block for block in blocks if block.joint == joint and len(block.columns)]
-        own = rows[joint]
-        if not own.any():  # columns of a cause at other joints
+        own = rows.own[joint]
+        if not len(own.place):  # columns of a cause at other joints
             continue
-        if len(beside) < 2 or own.shape[1] < MANY:
+        if len(beside) < 2 or len(own.place) < MANY:
             for block in beside:
-                out[block.columns] += block.Zi @ own
+                out[np.ix_(block.columns, own.place)] += block.Zi @ own.columns
             continue
-        used = np.flatnonzero(own.any(0))  # a tree leaves many columns of a joint zero
         columns = np.concatenate([block.columns for block in beside])
-        out[np.ix_(columns, used)] += _product_in_pieces([block.Zi for block in beside], own[:, used])
+        out[np.ix_(columns, own.place)] += _product_in_pieces([block.Zi for block in beside], own.columns)
     return out
 
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..estimation.joint_rows import JointRows
 from ..estimation.rows import UNKNOWN, Prior, Rows
-from ..estimation.sparse_rows import dense, places, spans
 
 __all__ = [
     "FoldSums",
@@ -42,7 +42,7 @@ TINY = 1e-12  # of the diagonal: the rounding of columns that nothing excites
 class Hypothesis(NamedTuple):
     """Regressor, prior and fixed torque (whitened rows) of one model of the data."""
 
-    X: Float[np.ndarray, "nv T P"]
+    X: JointRows
     prior: Prior
     fixed: Float[np.ndarray, "nv T"] | float = 0.0
 
@@ -83,80 +83,73 @@ class FoldSums(NamedTuple):
     square: Float[np.ndarray, " folds"]
 
 
-def fold_sums(rows: Rows, X: Float[np.ndarray, "nv T P"], y: Float[np.ndarray, "nv T"] | None = None) -> FoldSums:
+def fold_sums(rows: Rows, X: JointRows, y: Float[np.ndarray, "nv T"] | None = None) -> FoldSums:
     """X'X, X'y and y'y over each fold; `y` is the rows' own unless given."""
-    y = rows.y if y is None else y
-    folds, P = rows.fold.max() + 1, X.shape[2]
+    y, stretches = rows.y if y is None else y, _stretches(rows)
+    folds, P = rows.fold.max() + 1, X.width
     gram, moment, square = np.zeros((folds, P, P)), np.zeros((folds, P)), np.zeros(folds)
-    for columns, target, used in zip(X, y, spans(X), strict=True):
-        where = places(used)
-        G, m = np.zeros((folds, len(where), len(where))), np.zeros((folds, len(where)))
-        for fold, own in _stretches(rows):
-            few = dense(columns[own], used)
-            G[fold] += few.T @ few
-            m[fold] += few.T @ target[own]
-            square[fold] += target[own] @ target[own]
-        gram[:, where[:, None], where] += G
-        moment[:, where] += m
+    for own, target in zip(X.own, y, strict=True):
+        one = np.zeros((folds, len(own.place), len(own.place)))
+        for fold, here in stretches:
+            few = own.columns[here]
+            one[fold] += few.T @ few
+            moment[fold, own.place] += few.T @ target[here]
+            square[fold] += target[here] @ target[here]
+        gram[:, own.place[:, None], own.place] += one
     return FoldSums(gram, moment, square)
 
 
 def _stretches(rows: Rows) -> list[tuple[int, slice]]:
     """The rows of each fold as stretches that follow one another, with its number; rows of no fold are in none."""
-    return [(fold, own) for fold, own in _runs(rows) if fold >= 0]
-
-
-def _runs(rows: Rows) -> list[tuple[int, slice]]:
-    """As `_stretches`, with those of no fold as fold -1."""
     firsts = np.append(0, np.flatnonzero(np.diff(rows.fold)) + 1)
     ends = np.append(firsts[1:], len(rows.fold))
-    return [(int(rows.fold[a]), slice(int(a), int(b))) for a, b in zip(firsts, ends, strict=True)]
+    pairs = zip(firsts.tolist(), ends.tolist(), strict=True)
+    return [(int(rows.fold[a]), slice(a, b)) for a, b in pairs if rows.fold[a] >= 0]
 
 
-def _predicted(
-    rows: Rows, X: Float[np.ndarray, "nv T P"], each: Float[np.ndarray, "folds+1 P"]
-) -> Float[np.ndarray, "nv T 2"]:
+def _predicted(rows: Rows, X: JointRows, each: Float[np.ndarray, "folds+1 P"]) -> Float[np.ndarray, "nv T 2"]:
     """What the coefficients of `each` fold's fit make of its rows (nothing of those in no fold), and the last of all.
 
     All at once: the columns are read from memory once.
     """
-    out, own = np.zeros((*X.shape[:2], 2)), np.maximum(rows.fold, 0)[:, None]
-    for joint, used in enumerate(spans(X)):
-        every = sum((X[joint, :, one] @ each.T[one] for one in used), np.zeros((X.shape[1], len(each))))
-        out[joint, :, 0] = np.take_along_axis(every, own, axis=1)[:, 0]
-        out[joint, :, 1] = every[:, -1]
+    out, fold = np.zeros((*X.shape[:2], 2)), np.maximum(rows.fold, 0)[:, None]
+    for told, own in zip(out, X.own, strict=True):
+        every = own.columns @ each.T[own.place]
+        told[:, 0] = np.take_along_axis(every, fold, axis=1)[:, 0]
+        told[:, 1] = every[:, -1]
     out[:, rows.fold < 0, 0] = 0.0
     return out
 
 
-def grown_sums(rows: Rows, known: FoldSums, more: Float[np.ndarray, "nv T k"]) -> FoldSums:
+def grown_sums(rows: Rows, known: FoldSums, more: JointRows) -> FoldSums:
     """The sums of the rows' first columns, which are `known`, with those of columns more."""
-    (folds, P), k = known.moment.shape, more.shape[2]
+    (folds, P), k = known.moment.shape, more.width
     gram, moment = np.zeros((folds, P + k, P + k)), np.zeros((folds, P + k))
     gram[:, :P, :P], moment[:, :P] = known.gram, known.moment
-    for columns, others, target, used in zip(rows.X, more, rows.y, spans(rows.X), strict=True):
-        if not others.any():  # columns of a cause at other joints
+    for own, its, target in zip(rows.X.first(P).own, more.own, rows.y, strict=True):
+        if not len(its.place):  # columns of a cause at other joints
             continue
-        for fold, own in _stretches(rows):
-            for one in used:
-                first = slice(one.start, min(one.stop, P))
-                gram[fold, first, P:] += columns[own, first].T @ others[own]
-            gram[fold, P:, P:] += others[own].T @ others[own]
-            moment[fold, P:] += others[own].T @ target[own]
+        place = its.place + P
+        for fold, here in _stretches(rows):
+            few = its.columns[here]
+            gram[fold, own.place[:, None], place] += own.columns[here].T @ few
+            gram[fold, place[:, None], place] += few.T @ few
+            moment[fold, place] += few.T @ target[here]
     gram[:, P:, :P] = np.swapaxes(gram[:, :P, P:], 1, 2)
     return FoldSums(gram, moment, known.square)
 
 
 def prefix_sums(rows: Rows, gram: Float[np.ndarray, "folds P P"]) -> FoldSums:
     """The sums of the first columns of some rows, their products being known."""
-    count = gram.shape[1]
+    return _moments(rows, rows.X.first(gram.shape[1]), gram, rows.y)
+
+
+def _moments(rows: Rows, X: JointRows, gram: Float[np.ndarray, "folds P P"], y: Float[np.ndarray, "nv T"]) -> FoldSums:
     moment, square = np.zeros(gram.shape[:2]), np.zeros(len(gram))
-    for columns, target, used in zip(rows.X, rows.y, spans(rows.X), strict=True):
-        for fold, own in _stretches(rows):
-            for one in used:
-                first = slice(one.start, min(one.stop, count))
-                moment[fold, first] += columns[own, first].T @ target[own]
-            square[fold] += target[own] @ target[own]
+    for own, target in zip(X.own, y, strict=True):
+        for fold, here in _stretches(rows):
+            moment[fold, own.place] += target[here] @ own.columns[here]
+            square[fold] += target[here] @ target[here]
     return FoldSums(gram, moment, square)
 
 
@@ -168,13 +161,7 @@ def fewer_sums(known: FoldSums, without: Sequence[int]) -> FoldSums:
 
 def sums_of(rows: Rows, known: FoldSums, y: Float[np.ndarray, "nv T"]) -> FoldSums:
     """The sums of the same columns with another torque `y`."""
-    moment, square = np.zeros_like(known.moment), np.zeros_like(known.square)
-    for fold, own in _stretches(rows):
-        for columns, target, used in zip(rows.X[:, own], y[:, own], spans(rows.X), strict=True):
-            for one in used:
-                moment[fold, one] += target @ columns[:, one]
-        square[fold] += (y[:, own] ** 2).sum()
-    return FoldSums(known.gram, moment, square)
+    return _moments(rows, rows.X, known.gram, y)
 
 
 def coefficients(sums: FoldSums, prior: Prior) -> Float[np.ndarray, " P"]:
@@ -212,13 +199,13 @@ def judge(rows: Rows, hypothesis: Hypothesis, known: FoldSums | None = None, wit
     `known` are the sums of the hypothesis. The columns `without` are not fitted: their coefficients are zero.
     """
     X, y, prior = hypothesis.X, rows.y - hypothesis.fixed, hypothesis.prior
-    sums, kept = known or fold_sums(rows, X, y), np.delete(np.arange(X.shape[2]), without)
+    sums, kept = known or fold_sums(rows, X, y), np.delete(np.arange(X.width), without)
     if len(without):
         sums, prior = fewer_sums(sums, without), Prior(prior.mean[kept], prior.precision[kept])
     G, b, yy = (part.sum(0) for part in sums)
     solved = [_solve(G - g, b - m, yy - s, prior) for g, m, s in zip(*sums, strict=True)]
     solved.append(_solve(G, b, yy, prior))
-    each, costs = np.zeros((len(solved), X.shape[2])), np.array([cost for _, cost in solved])
+    each, costs = np.zeros((len(solved), X.width)), np.array([cost for _, cost in solved])
     each[:, kept] = [solution for solution, _ in solved]
     predicted = _predicted(rows, X, each)
     error, residual = y - predicted[..., 0], y - predicted[..., 1]
@@ -243,12 +230,10 @@ def judge_grown(rows: Rows, base: Ground, joints: Sequence[int], more: Float[np.
     """
     was, k, (folds, P) = base.verdicts, len(more), base.verdicts.folds.shape
     crossed, gram, moment = np.zeros((folds, P, k)), np.zeros((folds, k, k)), np.zeros((folds, k))
-    used = spans(rows.X)
     for fold, here in _stretches(rows):
         for one, joint in enumerate(joints):
-            Z = more[:, one, here]
-            for own in used[joint]:
-                crossed[fold, own] += rows.X[joint, here, own].T @ Z.T
+            Z, own = more[:, one, here], rows.X.own[joint]
+            crossed[fold, own.place] += own.columns[here].T @ Z.T
             gram[fold] += Z @ Z.T
             moment[fold] += Z @ rows.y[joint, here]
     shared, own, right = _without(crossed), _without(gram), _without(moment)[..., None]

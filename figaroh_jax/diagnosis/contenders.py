@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect, exact
+from ..estimation.joint_rows import JointRows
 from ..estimation.priors import physical_body
 from ..estimation.rows import UNKNOWN, Rows
-from ..estimation.sparse_rows import pulled
 from ..recordings.stacked import filtered_rows
 from ..results import Name
 from .believed import believed
@@ -210,9 +210,7 @@ def _as_one_rotor(step: Step, base: Ground, group: Group, order: np.ndarray) -> 
     rows, joints, found = step.rows, list(group.columns.joints), []
     for point in order:
         Z = group.columns.Z[point]
-        cross = np.sum(
-            [rows.X[joint].T @ own.T for joint, own in zip(joints, np.swapaxes(Z, 0, 1), strict=True)], axis=0
-        )
+        cross = rows.X.pulled_at(joints, Z).T
         G = np.tensordot(Z, Z, ((1, 2), (1, 2))) - cross.T @ base.inverse[-1] @ cross
         found.append(_none_below_zero(G, np.tensordot(Z, base.verdicts.residual[joints], 2)))
     best = np.argsort([-gain for gain, _ in found], kind="stable")
@@ -237,9 +235,8 @@ def _judged_beside(
     """The current model with columns more; links that it holds back are held no more than with these, or not at all."""
     if step.loose is None:
         return judge_grown(step.rows, base, joints, Z), None
-    more = np.zeros((*step.rows.y.shape, len(Z)))
-    more[list(joints)] = np.moveaxis(Z, 0, 2)
-    X = np.concatenate([step.rows.X, more], axis=2)
+    more = JointRows.at(joints, Z, len(step.rows.y))
+    X = step.rows.X.beside(more)
     sums, loose = grown_sums(step.rows, step.folded, more), step.loose.extended(len(Z))
     held, free = (judge(step.rows, Hypothesis(X, p), sums) for p in (believed(problem, loose, sums), loose))
     return held, free
@@ -260,7 +257,7 @@ def _body_verdicts(
 
 def _information(rows: Rows, base: Ground, Z: Float[np.ndarray, "nv T k"]) -> Float[np.ndarray, "k k"]:
     """Z'Z with the current model projected out: the precision of the columns' coefficients."""
-    tall, cross = Z.reshape(-1, Z.shape[2]), pulled(rows.X, np.moveaxis(Z, 2, 0)).T
+    tall, cross = Z.reshape(-1, Z.shape[2]), rows.X.pulled(np.moveaxis(Z, 2, 0)).T
     return tall.T @ tall - cross.T @ base.inverse[-1] @ cross
 
 
@@ -269,7 +266,7 @@ def for_refit(problem: Problem, step: Step, base: Ground, whitening: Float[np.nd
     n, _, count, nv = problem.records.shape
     residual = step.verdicts.residual.reshape(nv, n, count)
     response = whitening * step.state.response(problem.records.omega)[:, None]
-    return Whitened(residual, step.rows.X.reshape(nv, n, count, -1), base.inverse[-1], response)
+    return Whitened(residual, step.rows.X, base.inverse[-1], response)
 
 
 def _position_contender(
@@ -293,8 +290,8 @@ def _position_contender(
     ((name, parameter),) = effect.parameters().items()
     change, slope = _shift(problem, state, effect, name, ready.whitening)
     for _ in range(TURNS):
-        missing, cross = rows.y - change, pulled(rows.X, slope)
-        theta = base.inverse[-1] @ (pulled(rows.X, missing) + prior.precision * prior.mean)
+        missing, cross = rows.y - change, rows.X.pulled(slope)
+        theta = base.inverse[-1] @ (rows.X.pulled(missing) + prior.precision * prior.mean)
         taken = base.inverse[-1] @ cross
         own = float((slope**2).sum() - cross @ taken) + UNKNOWN
         move = float((slope * missing).sum() - cross @ theta) / own
@@ -370,7 +367,7 @@ def _response_contender(
     for _ in range(RESPONSE_TURNS):
         here = stand(problem, extended_state(problem, step.state, effect), whitening)
         slope = torque_slope(problem, here.state, effect, name, whitening)
-        sums = grown_sums(here.rows, here.folded, slope[..., None])
+        sums = grown_sums(here.rows, here.folded, JointRows.of(slope[..., None]))
         theta, variance = last_coefficient(sums, here.state.prior.extended(1))
         size = float(getattr(effect, name))
         value = float(np.clip(size + theta[-1], parameter.lower, parameter.upper))

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..estimation import sparse_rows
 from ..estimation.rows import Linear, Rows, block_sums, model_sums
 from .bank import Bank, Columns
 
@@ -106,7 +105,7 @@ def other_scores(
 ) -> Float[np.ndarray, "draws columns"]:
     """The scores that other residual rows would give: Zi'e - H'(Xi'e - the prior's rows), in their precision."""
     kind = residual.dtype
-    model = sparse_rows.pulled(rows.Xi, residual * rows.paired.astype(kind))
+    model = rows.Xi.pulled(residual * rows.paired.astype(kind))
     return pulled + ((prior - model) @ H).astype(kind)
 
 

@@ -211,7 +211,7 @@ def _products(
 ) -> Float[np.ndarray, "n columns columns"]:
     """Products of all columns in each recording: of the model, the effect's torque, the rivals at all their shapes."""
     n, _, count, nv = problem.records.shape
-    X = whitened(problem, state, whitening).X.reshape(nv, n, count, -1)
+    X = whitened(problem, state, whitening).X.dense().reshape(nv, n, count, -1)
     sizes = [float(getattr(effect, name)) for name in effect.amplitudes() or effect.parameters()]
     z = _rows(problem, state, batched(effect), whitening)[0]
     blocks = [X, np.tensordot(sizes, z, 1)[..., None]]

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..estimation import sparse_rows
 from ..estimation.rows import Linear, Rows
 from ..results import Candidate
 from .screening import Shown
@@ -42,8 +41,8 @@ def _products(
 ) -> tuple[Float[np.ndarray, "columns columns"], Float[np.ndarray, "columns P"]]:
     """Z Z' and Z X of the columns of all candidates, joint by joint: all columns in all rows would be large."""
     count = spans[-1].stop if spans else 0
-    raw, ZX = np.zeros((count, count)), np.zeros((count, rows.X.shape[2]))
-    for joint, (X, used) in enumerate(zip(rows.X, sparse_rows.spans(rows.X), strict=True)):
+    raw, ZX = np.zeros((count, count)), np.zeros((count, rows.X.width))
+    for joint, its in enumerate(rows.X.own):
         there = [
             (one.Z[:, list(one.joints).index(joint)], own)
             for one, own in zip(found, spans, strict=True)
@@ -53,8 +52,7 @@ def _products(
             at = np.concatenate([np.arange(own.start, own.stop) for _, own in there])
             Z = np.concatenate([columns for columns, _ in there])
             raw[np.ix_(at, at)] += Z @ Z.T
-            for one in used:
-                ZX[at, one] += Z @ X[:, one]
+            ZX[np.ix_(at, its.place)] += Z @ its.columns
     return raw, ZX
 
 

@@ -88,13 +88,14 @@ def friction_width(
     def columns(joint: int, z: Float[np.ndarray, "rows T"]) -> Float[np.ndarray, "rows P+"]:
         """Products with all columns of rows of one joint, where only its own smooth functions are not zero."""
         out = np.zeros((len(z), P + nv * k))
-        out[:, :P], out[:, P + joint * k : P + (joint + 1) * k] = z @ rows.X[joint], z @ smooth[joint]
+        own = rows.X.own[joint]
+        out[:, own.place], out[:, P + joint * k : P + (joint + 1) * k] = z @ own.columns, z @ smooth[joint]
         return out
 
     G, b = np.diag(prior.precision), prior.precision * prior.mean
-    for joint, (X, S, y) in enumerate(zip(rows.X, smooth, rows.y, strict=True)):
+    G[:P, :P] += rows.X.squares()
+    for joint, (S, y) in enumerate(zip(smooth, rows.y, strict=True)):
         own = slice(P + joint * k, P + (joint + 1) * k)
-        G[:P, :P] += X.T @ X
         G[own] += columns(joint, S.T)
         G[:P, own] = G[own, :P].T
         b += columns(joint, y[None])[0]
@@ -111,7 +112,6 @@ def friction_width(
         width[joint] = WIDTHS[best]
         z = tried[best]
         G, b = _replaced(G, b, column, crossed[best], z @ z, z @ rows.y[joint])[1:]
-        rows.X[joint, :, column] = z
     return problem if np.array_equal(width, problem.width) else problem.with_width(width)
 
 

@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float
 
 from ..effects.base import Effect
 from ..estimation import noise
+from ..estimation.joint_rows import JointRows
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Prior, Rows, fit
-from ..estimation.sparse_rows import products, pulled, spans, squares, times
 from ..results import Name
 from .bank import Columns
 from .comparison import ground, judge_grown, t_value
@@ -110,12 +110,12 @@ def foretold(problem: Problem, state: State, forbid: Collection[str] = ()) -> Bo
     """
     _, scale, count = _alike(problem, state)
     response = np.ones((len(np.asarray(problem.records.omega)), 1)) / scale
-    blocks = _rich(problem, state, response, forbid, count >= ENOUGH, RICHNESS).blocks
+    rich = _rich(problem, state, response, forbid, count >= ENOUGH, RICHNESS)
     step, out = stand(problem, state, response), np.zeros(len(scale), bool)
     base = ground(step.verdicts, step.state.prior, step.folded)
     for joint in range(len(scale)):
-        columns = np.concatenate([block[joint].T for block in blocks] or [np.zeros((0, 0))])
-        columns = columns[np.abs(columns).max(1, initial=0.0) > 0] if len(columns) else columns
+        columns = rich.columns(joint)
+        columns = columns[columns.any(1)]
         if len(columns):
             own = judge_grown(step.rows, base, (joint,), columns[:, None])
             worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, own))
@@ -133,7 +133,7 @@ def _alike(problem: Problem, state: State) -> tuple[Rows, Float[np.ndarray, " nv
     """Rows as they are, the RMS of what a fit with the joints weighted alike leaves of them, and rows a joint."""
     rows = plain_rows(problem, state)
     count = _rows_a_joint(rows)
-    rough = rows.y - times(rows.X, _weighted(rows, state.prior, np.sqrt((rows.y**2).mean(1))))
+    rough = rows.y - rows.X @ _weighted(rows, state.prior, np.sqrt((rows.y**2).mean(1)))
     return rows, np.sqrt((rough**2).sum(1) / count), count
 
 
@@ -150,7 +150,7 @@ def noise_rms(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, " nv"]:
 
 def _weighted(rows: Rows, prior: Prior, scale: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " P"]:
     """Coefficients with the joints weighted by `scale` (N m or N)."""
-    G, b = squares(rows.X, scale**-2.0), pulled(rows.X, rows.y / scale[:, None] ** 2)
+    G, b = rows.X.squares(scale**-2.0), rows.X.pulled(rows.y / scale[:, None] ** 2)
     return np.linalg.solve(G + np.diag(prior.precision + 1e-12), b + prior.precision * prior.mean)
 
 
@@ -161,7 +161,7 @@ def whitening_of(problem: Problem, spectrum: Spectrum) -> Float[np.ndarray, "F n
 
 
 def _from_repeats(problem: Problem, rows: Rows, state: State, response: Float[np.ndarray, "F nv"]) -> Spectrum:
-    residual = rows.y - times(rows.X, state.theta)
+    residual = rows.y - rows.X @ state.theta
     other = _mean_of_partners(rows, residual)
     partners = np.maximum((rows.partner >= 0).sum(0), 1)
     difference = (residual - other) / np.sqrt(1 + 1 / partners)
@@ -219,12 +219,10 @@ class _Rich(NamedTuple):
     state: State
     taken: list[_Taken]
 
-    @property
-    def blocks(self) -> list[Float[np.ndarray, "nv T k"]]:
-        """The columns of each group in the rows of all joints."""
-        ends = np.cumsum([one.kept.shape[1] for one in self.taken])
-        first = self.rows.X.shape[2] - (ends[-1] if len(ends) else 0)
-        return np.split(self.rows.X[:, :, first:], ends[:-1], axis=2) if self.taken else []
+    def columns(self, joint: int) -> Float[np.ndarray, "k T"]:
+        """The columns of the groups that one joint has."""
+        own = self.rows.X.after(self.rows.X.width - sum(one.kept.shape[1] for one in self.taken)).own[joint]
+        return own.columns.T
 
 
 def _behind(problem: Problem, rich: _Rich, response: Float[np.ndarray, "F nv"]) -> Rows:
@@ -237,8 +235,8 @@ def _behind(problem: Problem, rich: _Rich, response: Float[np.ndarray, "F nv"]) 
         found[one.name] if one.effect is None else exact_columns(problem, state, rows, response, one.effect)
         for one in rich.taken
     ]
-    more = [_full(rows, columns, 0) @ one.kept for columns, one in zip(each, rich.taken, strict=True)]
-    return rows._replace(X=np.concatenate([rows.X, *more], axis=2))
+    more = [_kept_of(rows, columns, 0, one.kept) for columns, one in zip(each, rich.taken, strict=True)]
+    return rows._replace(X=rows.X.beside(*more))
 
 
 def _rich(
@@ -254,7 +252,7 @@ def _rich(
     state = solved(state, fit(rows, state.prior).theta)
     groups = catalogue(problem, state, rows, response, forbid)
     groups += rich_families(problem, state, response, few=not smooth)
-    taken, prior, found, gram = [], state.prior, None, squares(rows.X)
+    taken, prior, found, gram = [], state.prior, None, rows.X.squares()
     for _ in range(richness):
         found = screen(rows, fit(rows, prior, gram), groups, found)
         scores = found.scores
@@ -266,20 +264,18 @@ def _rich(
             break  # the best of so many that noise alone would have: without it, the residual would be less than noise
         point = int(np.argmax(scores[best].Q))
         kept = kept_columns(scores[best].root[point])
-        more = _full(rows, groups[best].columns, point) @ kept
-        X = np.concatenate([rows.X, more], axis=2)
+        more = _kept_of(rows, groups[best].columns, point, kept)
+        X = rows.X.beside(more)
         gram = _grown_gram(gram, X, more)
-        rows, prior = rows._replace(X=X, Xi=X), prior.extended(more.shape[2])
+        rows, prior = rows._replace(X=X, Xi=X), prior.extended(more.width)
         effect = jax.tree.map(lambda x, p=point: x[p], groups[best].effect)  # None stays what it is
         taken.append(_Taken(groups[best].name, effect, kept))
     return _Rich(rows, state, taken)
 
 
-def _grown_gram(
-    gram: Float[np.ndarray, "P0 P0"], X: Float[np.ndarray, "nv T P"], more: Float[np.ndarray, "nv T k"]
-) -> Float[np.ndarray, "P P"]:
+def _grown_gram(gram: Float[np.ndarray, "P0 P0"], X: JointRows, more: JointRows) -> Float[np.ndarray, "P P"]:
     """X'X, of which that of the columns before the last, `more`, is known."""
-    cross, before = products(X, more), len(gram)
+    cross, before = X.products(more), len(gram)
     return np.block([[gram, cross[:before]], [cross[:before].T, cross[before:]]])
 
 
@@ -288,11 +284,9 @@ def _largest_by_chance(scores: Sequence[Score]) -> float:
     return float(np.sqrt(2 * np.log(max(sum(len(result.z) for result in scores), 1))))
 
 
-def _full(rows: Rows, columns: Columns, point: int) -> Float[np.ndarray, "nv T k"]:
-    """Columns of a group at a grid point, in the rows of all joints."""
-    full = np.zeros((*rows.y.shape, columns.Z.shape[1]))
-    full[list(columns.joints)] = np.moveaxis(columns.Z[point], 0, 2)
-    return full
+def _kept_of(rows: Rows, columns: Columns, point: int, kept: Float[np.ndarray, "k directions"]) -> JointRows:
+    """What is kept of a group's columns at a grid point."""
+    return JointRows.at(columns.joints, np.tensordot(kept.T, columns.Z[point], 1), len(rows.y))
 
 
 def kept_columns(root: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k directions"]:
@@ -308,29 +302,27 @@ def kept_columns(root: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k directi
 class _Basis(NamedTuple):
     """An orthonormal basis of what the columns of rows span, X times `directions`, and what it leaves of the torque."""
 
-    X: Float[np.ndarray, "nv T P"]
+    X: JointRows
     directions: Float[np.ndarray, "P basis"]
     residual: Float[np.ndarray, "nv T"]
 
     def of(self, joint: int, rows: slice = slice(None)) -> Float[np.ndarray, "rows basis"]:
         """Its rows of one joint: those of all joints would be the largest thing in memory."""
-        return sum(
-            (self.X[joint, rows, own] @ self.directions[own] for own in spans(self.X)[joint]),
-            np.zeros((len(range(self.X.shape[1])[rows]), self.directions.shape[1])),
-        )
+        own = self.X.own[joint]
+        return own.columns[rows] @ self.directions[own.place]
 
 
 def _basis(rows: Rows) -> _Basis:
     """What the rows' columns span, without the directions that rounding leaves."""
-    gram = squares(rows.X)
+    gram = rows.X.squares()
     scale = np.sqrt(np.diag(gram))
     seen = np.flatnonzero(scale > COLUMN_CUT * scale.max())
     values, vectors = np.linalg.eigh(gram[np.ix_(seen, seen)] / np.outer(scale[seen], scale[seen]))
     keep = values > RICH_CUT
     directions = np.zeros((len(scale), int(keep.sum())))
     directions[seen] = vectors[:, keep] / np.sqrt(values[keep]) / scale[seen, None]
-    theta = directions @ (directions.T @ pulled(rows.X, rows.y))
-    return _Basis(rows.X, directions, rows.y - times(rows.X, theta))
+    theta = directions @ (directions.T @ rows.X.pulled(rows.y))
+    return _Basis(rows.X, directions, rows.y - rows.X @ theta)
 
 
 def _fit(

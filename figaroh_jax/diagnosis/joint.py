@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from ..effects.base import Effect, exact
 from ..effects.catalogue import CATALOGUE, find
+from ..estimation.joint_rows import JointRows
 from ..estimation.rows import Rows, block_sums, model_sums
-from ..estimation.sparse_rows import pulled, squares, times
 from ..results import Name
 from .comparison import fold_sums
 from .design import fitted_fields, kind, shapes, with_shape
@@ -174,11 +174,9 @@ def with_parts(problem: Problem, joint: Joint, whitening: Float[np.ndarray, "F n
     step, fitted, state = joint.step, joint.fitted, joint.step.state
     rows = step.rows._replace(fold=problem.layout.part)
     slopes = [slope for e in joint.causes for slope in torque_slopes(problem, state, e, whitening)]
-    J = np.concatenate([rows.X, *(slope[..., None] for slope in slopes)], axis=2)
+    J = _with_slopes(rows, slopes)
     shape = [float(getattr(e, n)) for e in joint.causes for n in shapes(type(e))]
-    sums = fold_sums(
-        rows, J, rows.y - times(rows.X, state.theta) - times(J, fitted.value - np.append(state.theta, shape))
-    )
+    sums = fold_sums(rows, J, rows.y - rows.X @ state.theta - J @ (fitted.value - np.append(state.theta, shape)))
     count = len(sums.gram)
     if count < 2:
         return joint
@@ -206,13 +204,18 @@ def with_rest(
     """
     step, fitted = joint.step, joint.fitted
     slopes = [slope for e in joint.causes for slope in torque_slopes(problem, step.state, e, whitening)]
-    J = np.concatenate([step.rows.X, *(slope[..., None] for slope in slopes)], axis=2)
-    inverse = _inverse(squares(J) + np.diag(np.append(step.state.prior.precision, np.zeros(len(slopes)))))
+    J = _with_slopes(step.rows, slopes)
+    inverse = _inverse(J.squares() + np.diag(np.append(step.state.prior.precision, np.zeros(len(slopes)))))
     covariance = fitted.covariance.copy()
     for place, joints in zip(fitted.places, places, strict=True):
         at = np.ix_(place, place)
         covariance[at] += max(float(rest[list(joints)].mean()), 0.0) / PIECES * inverse[at]
     return joint._replace(fitted=replace(fitted, covariance=covariance))
+
+
+def _with_slopes(rows: Rows, slopes: Sequence[Float[np.ndarray, "nv T"]]) -> JointRows:
+    """The columns of the model, and those of the shapes of its causes."""
+    return rows.X.beside(JointRows.of(np.stack(slopes, axis=-1))) if slopes else rows.X
 
 
 def _wider(fitted: Fitted, times: Float[np.ndarray, " parameters"]) -> Fitted:
@@ -249,12 +252,12 @@ def joint_fit(problem: Problem, step: Step, causes: list[Effect], whitening: Flo
     each = [slope for e in causes for slope in torque_slopes(problem, state, e, whitening)]
     slopes = np.stack(each) if each else np.zeros((0, *rows.y.shape))
     precision = np.append(state.prior.precision, np.zeros(len(slopes)))
-    flat, cross = slopes.reshape(len(slopes), rows.y.size), pulled(rows.X, slopes)
+    flat, cross = slopes.reshape(len(slopes), rows.y.size), rows.X.pulled(slopes)
     A = np.block([[step.folded.gram.sum(0), cross.T], [cross, flat @ flat.T]]) + np.diag(precision)
     inverse = _inverse(A)
-    residual = rows.y - times(rows.X, state.theta)
+    residual = rows.y - rows.X @ state.theta
     pull = np.append(state.prior.precision * (state.prior.mean - state.theta), np.zeros(len(slopes)))
-    move = inverse @ (np.append(pulled(rows.X, residual), flat @ residual.reshape(-1)) + pull)
+    move = inverse @ (np.append(rows.X.pulled(residual), flat @ residual.reshape(-1)) + pull)
     values = [float(getattr(e, n)) for e in causes for n in shapes(type(e))]
     covariance = inverse @ (_scatter(rows, slopes, residual) + np.diag(precision)) @ inverse
     covariance = _widened(covariance, inverse, rows, residual, len(A))

@@ -19,7 +19,6 @@ from ..effects.catalogue import find
 from ..effects.inertia import LinkInertia
 from ..effects.transmission import RotorInertia
 from ..estimation.rows import UNKNOWN, Prior
-from ..estimation.sparse_rows import times
 from ..estimation.told import ABOUT_JOINT, TOLD, inertia_about_joint, possible, sizes, told_numbers
 from ..formats.assembly import Welded
 from ..results import Estimate, Gain, Links, MovedLink, Name
@@ -127,7 +126,7 @@ class _About:
     def __init__(
         self, problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], welded: Sequence[Welded] = ()
     ):
-        residual = step.rows.y - times(step.rows.X, step.state.theta)
+        residual = step.rows.y - step.rows.X @ step.state.theta
         self.level = max(float((residual**2).sum()) / max(step.rows.size, 1), 1.0)
         self.robot, self.count, self.own = problem.model, len(problem.believed), len(step.state.theta)
         self.rotors = _without_rotor(problem, step)

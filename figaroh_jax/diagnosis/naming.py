@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 
 from ..effects.base import Effect
 from ..effects.catalogue import find
+from ..estimation.joint_rows import JointRows
 from ..estimation.rows import Prior
 from ..recordings.stacked import filter_rows, filtered_rows, open_rows
 from ..results import Name
@@ -565,7 +566,7 @@ def _with_smooth(grown: _Grown, step: Step) -> Hypothesis:
     nothing of a cause of two numbers that acts on all joints.
     """
     problem, whitening, rows = grown.problem, grown.whitening, step.rows
-    n, samples, _, nv = problem.records.shape
+    n, samples, _, _ = problem.records.shape
     response = whitening * step.state.response(problem.records.omega)[:, None]
     own = []
     for joint, functions in enumerate(smooth_functions(step.state.motion)):
@@ -576,13 +577,9 @@ def _with_smooth(grown: _Grown, step: Step) -> Hypothesis:
     prior = step.state.prior
     size = np.concatenate([np.full(len(x), s) for x, s in zip(own, grown.size, strict=True)])
     more = Prior(prior.extended(len(size)).mean, np.append(prior.precision, size**-2.0))
-    first = rows.X.shape[2]
-    X = np.zeros((nv, rows.X.shape[1], first + len(size)))
-    X[:, :, :first] = rows.X
-    for joint, one in enumerate(own):
-        X[joint, :, first : first + len(one)] = one.T
-        first += len(one)
-    return Hypothesis(X, more)
+    places = np.split(np.arange(len(size)), np.cumsum([len(x) for x in own])[:-1])
+    smooth = JointRows([(np.ascontiguousarray(x.T), at) for x, at in zip(own, places, strict=True)], len(size))
+    return Hypothesis(rows.X.beside(smooth), more)
 
 
 def _one_part(effect: Effect, fitted: Fitted, place: tuple[int, ...]) -> bool:

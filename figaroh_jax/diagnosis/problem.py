@@ -18,11 +18,12 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from ..effects.base import Effect, Motion
 from ..effects.catalogue import CATALOGUE
+from ..estimation.joint_rows import JointRows
 from ..estimation.priors import rigid_prior
 from ..estimation.rows import Rows
 from ..recordings.stacked import Records, filter_rows, open_rows
 from ..rigid.model import RobotModel
-from ..rigid.regressor import packed_regressor, pairs
+from ..rigid.regressor import coordinate_blocks, packed_regressor
 from ..simulators.contract import Backend
 from .comparison import FoldSums, Verdicts, fold_sums, grown_sums, prefix_sums
 from .design import SHORT, Units, candidates, flattened, kind, shapes, units
@@ -123,7 +124,9 @@ class Part:
         """Ten columns a link along a motion, each joint a coordinate of its own; their torque by inverse dynamics."""
 
         def make() -> _Columns:
-            return _of_blocks(np.asarray(packed_regressor(model, *motion)), pairs(model))
+            blocks, (where, place) = np.asarray(packed_regressor(model, *motion)), coordinate_blocks(model.joints)
+            order = np.argsort(place)  # recordings may have their columns in another order than the tree
+            return _of_blocks(blocks if (np.diff(order) > 0).all() else blocks[order], where)
 
         def quick(theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, "nN nv"]:
             return rigid_torque(eqx.tree_at(lambda m: m.inertia, model, theta.reshape(-1, 10)), *motion)
@@ -185,7 +188,7 @@ class Part:
 
 
 def _of_blocks(blocks: Float[np.ndarray, "pairs 10 nN"], where: Int[np.ndarray, "pairs 2"]) -> _Columns:
-    """Ten columns for each joint and link that the tree does not make zero, in order of the joints."""
+    """Ten columns for each coordinate and link that the tree does not make zero, in order of the coordinates."""
     flat = blocks.reshape(-1, blocks.shape[2])
     used = np.asarray(flat[:, :TURNED].any(1))
     used[~used] = flat[~used].any(1)
@@ -219,14 +222,14 @@ class Filtered:
     """Parts of regressors through the row filter and a response, kept while they are used: most stay the same."""
 
     def __init__(self) -> None:
-        self._last: tuple[ref[np.ndarray], list[tuple[ref[np.ndarray], int]], ref[Any], np.ndarray] | None = None
+        self._last: tuple[ref[JointRows], list[tuple[ref[np.ndarray], int]], ref[Any], np.ndarray] | None = None
         self._sums: list[_Made] = []  # the last few
         # filtered columns by the addresses of the series and of the filter, as long as these live, and by the response
         self._kept: OrderedDict[tuple[int, int, bytes], tuple[ref[Any], ref[Any], np.ndarray]] = OrderedDict()
 
     def rows(
         self, records: Records, parts: Sequence[Part], response: Complex[np.ndarray, "F nv"] | Float[np.ndarray, "F nv"]
-    ) -> Float[np.ndarray, "nv T P"]:
+    ) -> JointRows:
         """Masked rows of the parts side by side."""
         response, factor = without_factor(response)
         code = blake2b(np.ascontiguousarray(response).tobytes(), digest_size=16).digest()
@@ -246,7 +249,7 @@ class Filtered:
         count, known = max(((one.shared(made), k) for k, one in enumerate(self._sums)), default=(0, 0))
         if count:
             first = prefix_sums(rows, self._sums[known].gram[:, :count, :count])
-            sums = grown_sums(rows, first, rows.X[:, :, count:])
+            sums = grown_sums(rows, first, rows.X.after(count))
         else:
             sums = fold_sums(rows, rows.X)
         self._sums = [made._replace(gram=sums.gram), *self._sums[: MOST_SUMS - 1]]
@@ -270,14 +273,22 @@ class Filtered:
 
 def _beside(
     parts: Sequence[Part], blocks: Sequence[Float[np.ndarray, "T _"]], weight: Float[np.ndarray, "nv T 1"]
-) -> Float[np.ndarray, "nv T P"]:
-    """The filtered parts side by side, each row times its weight; a tree leaves most of them zero."""
-    ends = np.cumsum([part.width for part in parts])
-    X = np.zeros((*weight.shape[:2], ends[-1]))
-    for part, block, end in zip(parts, blocks, ends, strict=True):
+) -> JointRows:
+    """The filtered parts side by side, each row times its weight."""
+    firsts = np.cumsum([0, *(part.width for part in parts)])
+    found: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in weight]
+    for part, block, first in zip(parts, blocks, firsts, strict=False):
         for joint, own, columns in part.spans:
-            np.multiply(block[:, own], weight[joint], out=X[joint, :, end - part.width : end][:, columns])
-    return X
+            found[joint].append((block[:, own], np.arange(first + columns.start, first + columns.stop)))
+    out = []
+    for factor, own in zip(weight, found, strict=True):
+        place = np.concatenate([at for _, at in own] or [np.zeros(0, int)])
+        X = np.empty((len(factor), len(place)))
+        ends = np.cumsum([len(at) for _, at in own])
+        for (block, at), end in zip(own, ends, strict=True):
+            np.multiply(block, factor, out=X[:, end - len(at) : end])
+        out.append((X, place))
+    return JointRows(out, int(firsts[-1]))
 
 
 def without_factor(response: np.ndarray) -> tuple[np.ndarray, Float[np.ndarray, " nv"]]:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from ..effects.base import Effect, Motion
+from ..estimation.joint_rows import JointRows
 from ..recordings.stacked import Records
 from .design import Units, local, shapes, unit_rows, units_and_slopes, with_shape
 from .shifts import links_torque, torque_change
@@ -33,7 +34,7 @@ class Whitened(NamedTuple):
     """Residual and regressor of the current model as whitened rows, `A^-1`, and the whitening response."""
 
     residual: Float[np.ndarray, "nv n M"]
-    X: Float[np.ndarray, "nv n M P"]
+    X: JointRows
     inverse: Float[np.ndarray, "P P"]
     whitening: Complex[np.ndarray, "F nv"] | Float[np.ndarray, "F nv"]
 
@@ -101,11 +102,10 @@ def profile(
 
     With x = G^-1 s: dJ = x' dG x - 2 ds'x.
     """
-    residual, X = (x[joints[0]] if len(joints) == 1 else x[joints] for x in (whitened.residual, whitened.X))
-    residual, X = residual.reshape(-1), X.reshape(-1, whitened.X.shape[-1])
+    residual, (X, place) = whitened.residual[joints].reshape(-1), whitened.X.tall(joints)
     flat, changes = (x.reshape(*x.shape[:-3], -1) for x in (Z, slope))
     s, C, gram = flat @ residual, flat @ X, flat @ np.swapaxes(flat, -1, -2)
-    taken = C @ whitened.inverse
+    taken = C @ whitened.inverse[np.ix_(place, place)]
     scale = np.sqrt(np.diagonal(gram, axis1=-2, axis2=-1) + 1e-300)
     unit = (gram - taken @ np.swapaxes(C, -1, -2)) / (scale[..., None] * scale[..., None, :])
     x = np.linalg.solve(unit + RIDGE * np.eye(flat.shape[-2]), (s / scale)[..., None])[..., 0] / scale
@@ -160,7 +160,7 @@ def _on_device(motion: Motion) -> Any:
 def shift_profile(change: Float[np.ndarray, "sizes nv T"], whitened: Whitened) -> Float[np.ndarray, " sizes"]:
     """J of whitened rows of exact changes of the torque."""
     D = change.reshape(len(change), -1)
-    C = D @ whitened.X.reshape(D.shape[1], -1)
+    C = whitened.X.pulled(change.reshape(len(change), len(whitened.residual), -1))
     return (D * (D - 2 * whitened.residual.reshape(-1))).sum(1) - ((C @ whitened.inverse) * C).sum(1)
 
 

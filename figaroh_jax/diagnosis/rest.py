@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from ..estimation import noise
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Linear, Rows
-from ..estimation.sparse_rows import pulled, times
 from ..recordings.stacked import filter_rows
 from ..results import Dependence, Part, Verdict
 from .comparison import ground, judge_grown, t_needed, t_value
@@ -153,8 +152,8 @@ def beyond_noise(
 
 def _left_of(noise: Float[np.ndarray, "draws nv T"], rows: Rows, linear: Linear) -> Float[np.ndarray, "draws nv T"]:
     """What a fit leaves of rows of noise."""
-    theta = pulled(rows.Xi, noise * rows.paired) @ linear.inverse.T
-    return noise - np.moveaxis(times(rows.X, theta.T), 2, 0)
+    theta = rows.Xi.pulled(noise * rows.paired) @ linear.inverse.T
+    return noise - np.moveaxis(rows.X @ theta.T, 2, 0)
 
 
 def repeating(
@@ -273,8 +272,8 @@ def follows_others(problem: Problem, state: State, tolerance: float) -> Follows 
     step = stand(problem, state, white)
     base, (columns, places) = ground(step.verdicts, step.state.prior, step.folded), products(step.state.motion)
     for joint in large:
-        rows, X = _rows_at(problem, step.state, columns, white, joint), step.rows.X[joint]
-        across, pull = X.T @ rows.T, rows @ step.verdicts.residual[joint]
+        rows = _rows_at(problem, step.state, columns, white, joint)
+        across, pull = step.rows.X.pulled_at((joint,), rows[:, None]).T, rows @ step.verdicts.residual[joint]
         gram = rows @ rows.T - across.T @ base.inverse[-1] @ across
         taken = [pull[at] @ np.linalg.lstsq(gram[np.ix_(at, at)], pull[at], rcond=None)[0] for at in map(list, places)]
         best, names = list(places[int(np.argmax(taken))]), problem.model.dof_names

@@ -258,7 +258,7 @@ class Null:
         pairs = zip(found.stock.candidates, found.stock.parts, strict=True)
         known = {id(one): before.get(id(one)) or (one, pulled(one, own, noise)) for one, own in pairs}
         self._products[part] = known
-        prior = np.sqrt(np.maximum(np.diag(linear.moment) - (rows.Xi**2).sum((0, 1)), 0))
+        prior = np.sqrt(np.maximum(np.diag(linear.moment) - rows.Xi.lengths, 0))
         pulls = prior * np.random.default_rng([self._seed, part, 1]).standard_normal((CHUNK, len(prior)))
         return other_scores(rows, found.H, noise, np.concatenate([x for _, x in known.values()], axis=1), pulls)
 
@@ -367,7 +367,7 @@ def _row_response(
 
 
 def _link_columns(rows: Rows, link: int, model: RobotModel) -> Columns:
-    Z = np.swapaxes(rows.X[:, :, 10 * link : 10 * link + 10], 1, 2)
+    Z = np.swapaxes(rows.X.dense(10 * link, 10 * link + 10), 1, 2)
     return Columns(tuple(range(model.nv)), np.moveaxis(Z, 1, 0)[None])
 
 

@@ -17,6 +17,7 @@ from jaxtyping import Complex, Float, Int
 from ..effects.base import Effect, Motion, changed, place
 from ..effects.catalogue import find
 from ..errors import InputError
+from ..estimation.joint_rows import JointRows
 from ..estimation.priors import body_precision, rigid_prior
 from ..estimation.rows import Prior, Rows, instruments
 from ..recordings.stacked import filtered_rows
@@ -416,21 +417,21 @@ def whitened(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"
     X = X if state.cut is None else _cut_rows(problem, state, X, response)
     Xi = X
     if layout.repeats:
-        Xi = np.stack([instruments(x.T, layout.partner, p).T for x, p in zip(X, layout.paired, strict=True)])
-    return Rows(y, X, np.ascontiguousarray(Xi), *_row_layout(layout))
+        pairs = zip(X.own, layout.paired, strict=True)
+        each = [(instruments(own.columns.T, layout.partner, p).T, own.place) for own, p in pairs]
+        Xi = JointRows([(np.ascontiguousarray(columns), place) for columns, place in each], X.width)
+    return Rows(y, X, Xi, *_row_layout(layout))
 
 
-def _cut_rows(
-    problem: Problem, state: State, X: Float[np.ndarray, "nv T P"], response: Complex[np.ndarray, "F nv"]
-) -> Float[np.ndarray, "nv T P"]:
+def _cut_rows(problem: Problem, state: State, X: JointRows, response: Complex[np.ndarray, "F nv"]) -> JointRows:
     """The rows with those of the joints whose drives are at their limit at times as these let them through."""
     assert state.cut is not None
-    X, through = X.copy(), state.cut.through
+    through = state.cut.through
     for joint in np.flatnonzero((through != 1).any(0)).tolist():
         factor = through[:, joint]
         whole = [False, *(term.has("through") for term in state.terms)]
         parts = [p.times(np.ones_like(factor) if w else factor, joint) for w, p in zip(whole, state.parts, strict=True)]
-        X[joint] = problem.filtered.rows(problem.records, parts, response)[joint]
+        X = X.replaced(joint, problem.filtered.rows(problem.records, parts, response))
     return X
 
 
@@ -443,7 +444,7 @@ def _unexplained(
     problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], response: Complex[np.ndarray, "F nv"]
 ) -> Float[np.ndarray, "nv T"]:
     """Rows of the measured torque, less what the sensors read of a known one."""
-    rows = problem.filtered.rows(problem.records, [problem.read], whitening)[..., 0]
+    rows = problem.filtered.rows(problem.records, [problem.read], whitening).dense()[..., 0]
     if state.carried is None and state.cut is None:
         return rows
     return rows - filtered_rows(problem.records, state.known, response)

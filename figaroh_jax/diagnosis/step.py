@@ -55,7 +55,7 @@ def stand(problem: Problem, state: State, whitening: Float[np.ndarray, "F nv"], 
     rows = whitened(problem, state, whitening)
     same = before is not None and len(before.state.sensors) == len(state.sensors) and before.state.cut is state.cut
     if before is not None and same:
-        folded = grown_sums(rows, before.folded, rows.X[:, :, before.folded.moment.shape[1] :])
+        folded = grown_sums(rows, before.folded, rows.X.after(before.folded.moment.shape[1]))
     else:
         folded = problem.filtered.sums(rows)
     state = replace(state, prior=believed(problem, state.prior, folded))

@@ -131,9 +131,10 @@ def _whitened_rows(
 
 def _left(rows: Rows, state: State, joint: int, smooth: Float[np.ndarray, "T k"]) -> Float[np.ndarray, " T"]:
     """Residual of one joint's rows, the baseline's coefficients free for it alone (within their prior)."""
-    X = np.concatenate([rows.X[joint], smooth], axis=1)
-    precision = np.append(state.prior.precision, np.zeros(smooth.shape[1]))
-    mean = np.append(state.prior.mean, np.zeros(smooth.shape[1]))
+    own = rows.X.own[joint]
+    X = np.concatenate([own.columns, smooth], axis=1)
+    precision = np.append(state.prior.precision[own.place], np.zeros(smooth.shape[1]))
+    mean = np.append(state.prior.mean[own.place], np.zeros(smooth.shape[1]))
     A = X.T @ X
     A += np.diag(precision + RIDGE * np.diag(A) + 1e-12)
     return rows.y[joint] - X @ np.linalg.solve(A, X.T @ rows.y[joint] + precision * mean)

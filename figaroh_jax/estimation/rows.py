@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from .sparse_rows import products, pulled, spans, squares, times
+from .joint_rows import JointRows
 
 __all__ = ["Linear", "Prior", "Rows", "block_sums", "fit", "instruments", "model_sums"]
 
@@ -35,8 +35,8 @@ class Rows(NamedTuple):
     """Whitened torque and regressor of the current model, with the layout of blocks and folds."""
 
     y: Float[np.ndarray, "nv T"]
-    X: Float[np.ndarray, "nv T P"]
-    Xi: Float[np.ndarray, "nv T P"]
+    X: JointRows
+    Xi: JointRows
     paired: Float[np.ndarray, "nv T"]  # 1 where a row has a partner to take instruments from
     partner: Int[np.ndarray, "partners T"]  # row of each other repeat, -1 where there is none
     block: Int[np.ndarray, " T"]  # of some seconds; -1 for padding
@@ -68,12 +68,12 @@ def fit(rows: Rows, prior: Prior, gram: Float[np.ndarray, "P P"] | None = None) 
     `gram` is X'X where that is known.
     """
     repeats = bool(len(rows.partner))
-    cross = products(rows.Xi, rows.X) if repeats or gram is None else gram
+    cross = rows.Xi.products(rows.X) if repeats or gram is None else gram
     A = (cross + cross.T) / 2 + np.diag(prior.precision)
     inverse = np.linalg.inv(_conditioned(A))
-    theta = inverse @ (pulled(rows.Xi, rows.y * rows.paired) + prior.precision * prior.mean)
-    moment = (squares(rows.Xi) if repeats else cross) + np.diag(prior.precision)
-    residual = rows.y - times(rows.X, theta)
+    theta = inverse @ (rows.Xi.pulled(rows.y * rows.paired) + prior.precision * prior.mean)
+    moment = (rows.Xi.squares() if repeats else cross) + np.diag(prior.precision)
+    residual = rows.y - rows.X @ theta
     return Linear(theta, inverse, residual, moment, prior.precision * (theta - prior.mean))
 
 
@@ -108,14 +108,11 @@ def block_sums(
     return out
 
 
-def model_sums(
-    rows: Rows, X: Float[np.ndarray, "nv T P"], residual: Float[np.ndarray, "nv T"]
-) -> Float[np.ndarray, "P blocks"]:
+def model_sums(rows: Rows, X: JointRows, residual: Float[np.ndarray, "nv T"]) -> Float[np.ndarray, "P blocks"]:
     """`block_sums` of the residual and each column of the model, over the joints."""
-    out = np.zeros((X.shape[2], rows.block.max() + 1))
-    for columns, weight, own in zip(X, residual, spans(X), strict=True):
-        for one in own:
-            out[one] += block_sums(rows, weight, columns[:, one].T)
+    out = np.zeros((X.width, rows.block.max() + 1))
+    for own, weight in zip(X.own, residual, strict=True):
+        out[own.place] += block_sums(rows, weight, own.columns.T)
     return out
 
 
