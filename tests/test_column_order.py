@@ -56,7 +56,7 @@ def test_columns_of_links_stand_at_the_joints_of_the_recording(
     size = np.abs(expected).max()
     np.testing.assert_allclose(part.torque(theta), expected, rtol=0, atol=1e-11 * size)  # by inverse dynamics
     np.testing.assert_allclose(part.torque(theta, slice(0, 200)), expected, rtol=0, atol=1e-11 * size)  # by columns
-    dense = np.moveaxis(part.dense(range(len(theta))), 2, 0)
+    dense = part.dense(range(len(theta))).transpose(2, 1, 0)
     np.testing.assert_allclose(dense @ theta, expected, rtol=0, atol=1e-11 * size)
 
 
