@@ -93,9 +93,14 @@ def _line(first: Any, answer: Any) -> str:
     mine, its = ({(c["effect"], frozenset(c["at"])): c for c in one["causes"]} for one in (first, answer))
     moved = 0.0
     for cause in set(mine) & set(its):
-        for key, told in mine[cause]["parameters"].items():
+        ours, theirs = mine[cause]["parameters"], its[cause]["parameters"]
+        if cause[0] == "gravity_tilt":  # its axes are the base's
+            size = [np.hypot(*(told["value"] for told in one.values())) for one in (ours, theirs)]
+            moved = max(moved, abs(size[1] - size[0]) / min(told["std"] for told in ours.values()))
+            continue
+        for key, told in ours.items():
             if told["std"]:
-                moved = max(moved, abs(its[cause]["parameters"][key]["value"] - told["value"]) / told["std"])
+                moved = max(moved, abs(theirs[key]["value"] - told["value"]) / told["std"])
     words = [
         ", ".join(f"{e} {' '.join(sorted(at))}" for e, at in set(a) - set(b)) for a, b in ((its, mine), (mine, its))
     ]

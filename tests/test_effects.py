@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 import reference
 import robots
+from scipy.spatial.transform import Rotation
 
 import figaroh_jax as fj
 from figaroh_jax.effects.base import Effect, Motion, amplitude, columns, joint_unit, place, shape, smooth_sign
 from figaroh_jax.effects.catalogue import CATALOGUE, find, register, related
+from figaroh_jax.effects.environment import level_axes
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.rigid.model import RobotModel
@@ -177,6 +179,24 @@ def expected(name: str, motion: Motion, p: dict[str, float]) -> np.ndarray:
         "torque_saturation": lambda: np.clip(total[:, 1], -p["limit"], p["limit"]) - total[:, 1],
     }
     return equations[name]()
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.3, -0.7, -0.5), None])
+def test_a_base_tilts_about_two_axes_across_gravity_wherever_it_is_mounted(up: tuple[float, ...] | None) -> None:
+    """Upright, hanging, on a wall and at any angle: the smallest turn (SciPy) takes z up and x, y across."""
+    way = np.random.default_rng().normal(size=3) if up is None else np.array(up)
+    way /= np.linalg.norm(way)
+    axis, angle = np.cross([0.0, 0.0, 1.0], way), np.arccos(way[2])
+    if np.linalg.norm(axis) < 1e-12:  # all turns by pi are as small: about x
+        axis = np.array([1.0, 0.0, 0.0])
+    turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * angle).as_matrix()
+    np.testing.assert_allclose(level_axes(-9.81 * way), turn[:, :2], rtol=0, atol=1e-12)
+    model = eqx.tree_at(lambda m: m.gravity, load_urdf(fj.DEMO), jnp.asarray(-9.81 * way))
+    told = find("gravity_tilt")(np.zeros(0, int), **{"x": 0.05, "y": -0.03})
+    tilted = np.asarray(told.change(model).gravity)
+    angles = told.physical()
+    lean = Rotation.from_rotvec(turn[:, 0] * angles["about_x"] + turn[:, 1] * angles["about_y"]).as_matrix()
+    np.testing.assert_allclose(tilted, lean.T @ np.asarray(model.gravity), rtol=0, atol=2e-4)  # second order
 
 
 TORQUES = [n for n, e in CATALOGUE.items() if e.has("torque") or e.has("change") or e.has("torque_error")]

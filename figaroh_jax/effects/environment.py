@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from ..rigid.kinematics import axis_twists, gather, movers, pose_columns, poses_on_host
 from ..rigid.model import RobotModel
@@ -13,12 +13,16 @@ from .base import Effect, Motion, Scalar, amplitude, shape
 from .loops import HERE, InRollouts
 from .registry import register
 
-__all__ = ["Contact", "ExternalWrench", "GravityTilt", "PointEffect"]
+__all__ = ["Contact", "ExternalWrench", "GravityTilt", "PointEffect", "level_axes"]
 
 
 @register
 class GravityTilt(Effect):
-    """A base that is not level: gravity in the base frame has a horizontal part."""
+    """A base that is not level: gravity in the base frame has a horizontal part.
+
+    For a base that is not upright (on a wall, under a ceiling) x and y are those of the base frame, turned by the
+    smallest turn that takes its z axis up.
+    """
 
     name, title, acts_on = "gravity_tilt", "base tilt", "robot"
     like_links = True
@@ -32,17 +36,30 @@ class GravityTilt(Effect):
 
     def change(self, model: RobotModel) -> RobotModel:
         """The robot with x and y added to gravity in its base frame, m/s2."""
-        tilted = model.gravity + jnp.stack([jnp.asarray(self.x), jnp.asarray(self.y), jnp.zeros(())])
+        tilted = model.gravity + level_axes(model.gravity) @ jnp.stack([jnp.asarray(self.x), jnp.asarray(self.y)])
         return eqx.tree_at(lambda m: m.gravity, model, tilted)
 
     def physical(self) -> dict[str, Scalar]:
-        """The tilt itself: angles about the base's x and y axes, rad, for a base that leans by little (9.81 m/s2)."""
+        """The tilt itself: angles about those x and y axes, rad, for a base that leans by little (9.81 m/s2)."""
         return {"about_x": -self.y / 9.81, "about_y": self.x / 9.81}
 
     @classmethod
     def units(cls) -> dict[str, str]:
         """Those of `physical`: rad."""
         return {"about_x": "rad", "about_y": "rad"}
+
+
+def level_axes(gravity: Float[ArrayLike, "3"]) -> Float[Array, "3 2"]:
+    r"""The base's x and y axes after the smallest turn that takes its z axis up, in the base frame.
+
+    With up u = -g / |g|: $e_i - u_i (e_z + u) / (1 + u_z)$ (Rodrigues' formula); where z points down, x and -y.
+    """
+    g = jnp.asarray(gravity)
+    size = jnp.linalg.norm(g)
+    up = jnp.where(size > 0, -g / jnp.where(size > 0, size, 1.0), jnp.array([0.0, 0.0, 1.0], g.dtype))
+    down = up[2] < -1 + 1e-9
+    turned = jnp.eye(3, dtype=g.dtype)[:, :2] - jnp.outer(up.at[2].add(1.0), up[:2]) / jnp.where(down, 1.0, 1 + up[2])
+    return jnp.where(down, jnp.array([[1.0, 0.0], [0.0, -1.0], [0.0, 0.0]], g.dtype), turned)
 
 
 class PointEffect(Effect):
