@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from figaroh_jax.diagnosis import weights
+from figaroh_jax.estimation.joint_rows import JointRows
 
 ROWS, TOP = 4000, 2.0
 
@@ -16,7 +17,7 @@ ROWS, TOP = 4000, 2.0
 def factors(monkeypatch: pytest.MonkeyPatch, torque: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Mean squares by speed over those of fast rows, of one joint with friction in its baseline; rows are samples."""
     s = np.sign(v)
-    rows = SimpleNamespace(y=torque[None], X=np.stack([v, s], 1)[None])
+    rows = SimpleNamespace(y=torque[None], X=JointRows.of(np.stack([v, s], 1)[None]))
     prior = SimpleNamespace(precision=np.zeros(2), mean=np.zeros(2))
     motion = SimpleNamespace(velocity=v[:, None], direction=s[:, None])
     records = SimpleNamespace(
