@@ -127,6 +127,14 @@ def test_a_law_of_the_speed_is_judged_at_its_shape() -> None:
     assert least_of(("power_law_friction", [22.0, 0.68], 0.99, law)) == 0  # -4.0 +- 3.1
 
 
+def test_friction_that_builds_up_over_a_distance_which_may_be_zero_goes() -> None:
+    """Of a clean arm .59 +- .38 N m over .22 +- .34 mrad were named: plain friction, as far as anybody can tell."""
+    law = {"force": 0.588, "distance": 0.219e-3}
+    assert least_of(("presliding", [0.193, 0.175e-3], 0.0, law)) == 0
+    assert least_of(("presliding", [0.193, 0.1e-3], 0.0, law)) is None
+    assert least_of(("presliding", [0.35, 0.1e-3], 0.0, law)) == 0  # the force may be zero
+
+
 def test_more_power_than_noise_can_have_is_a_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two joints of 400 independent rows: deviations of their power are sqrt(2 / 400) (chi-square)."""
     nothing, shape = cast(Any, None), (2, 400)

@@ -373,12 +373,15 @@ def least_sure(joint: Joint) -> int | None:
 
     Of a law of the speed whose shape is open the amplitude is judged at that shape: the same friction comes of many
     pairs of strength and exponent, none of them surely, and of no strength at none. So it is with friction that fades.
+    Friction that builds up over a distance which may be zero may be plain friction.
     """
     shares = []
     for effect, place in zip(joint.causes, joint.fitted.places, strict=True):
         own = _amplitudes(effect) if kind(effect) == "columns" else list(range(len(place)))
         given = _shape_places(effect, place) if effect.speed_law or effect.fades else ()
-        shares.append(_beyond_zero(effect, joint.fitted, place, own, given) if own else np.inf)
+        there = [(own, given)] if own else []
+        there += [([fitted_fields(effect).index(name)], ()) for name in effect.vanishes]
+        shares.append(min((_beyond_zero(effect, joint.fitted, place, *which) for which in there), default=np.inf))
     least = int(np.argmin(shares)) if shares else 0
     return least if shares and shares[least] <= 1 else None
 

@@ -309,6 +309,7 @@ class Effect(eqx.Module):
     of_position: ClassVar[bool] = False  # whether it follows the position of its joint alone, as weight may
     beside_rest: ClassVar[bool] = True  # whether it can be told from a rest that stays; no law of what any rest does
     fades: ClassVar[bool] = False  # whether it goes by the time since the start: another recording has it no more
+    vanishes: ClassVar[tuple[str, ...]] = ()  # shapes at whose zero it adds nothing, whatever its amplitudes
     about: ClassVar[tuple[str, str] | None] = None  # a shape about which its torque is linear in an amplitude: `exact`
     abrupt: ClassVar[bool] = False  # whether its `position_error` steps where the load changes its side
     one_rotor: ClassVar[

@@ -228,6 +228,7 @@ class Bristle(JointEffect):
     """Dry friction with a state: a bristle that bends before it slides, in units of its sliding deflection."""
 
     rubs = True
+    vanishes = ("distance",)
     force: Scalar = amplitude("N m", lower=0.0)
     # teeth and bearings yield by a hundredth of a radian before they slide; a cable that is dragged along, by tenths
     distance: Scalar = shape("rad", (0.0003, 0.001, 0.003, 0.01, 0.03, 0.08), (2e-5, 0.1))
