@@ -75,6 +75,10 @@ def test_what_is_missing_does_not_depend_on_the_order_of_columns(order: list[str
         assert main(["diagnose", str(file), "--out", str(tmp_path / str(len(told))), "--quiet"]) == 0
         told.append(json.loads((tmp_path / str(len(told)) / "answer.json").read_text()))
     as_it_is, turned = told
+    hidden = yaml.safe_load((DEMO / "truth.yaml").read_text())["causes"]
+    assert {(c["effect"], *sorted(c["at"])) for c in turned["causes"]} == {
+        (c["effect"], *sorted(c["at"])) for c in hidden
+    }
     assert turned["verdict"] == as_it_is["verdict"] == "named"
     for one, other in zip(as_it_is["causes"], turned["causes"], strict=True):
         assert (one["effect"], set(one["at"])) == (other["effect"], set(other["at"]))

@@ -191,12 +191,20 @@ def test_a_base_tilts_about_two_axes_across_gravity_wherever_it_is_mounted(up: t
         axis = np.array([1.0, 0.0, 0.0])
     turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * angle).as_matrix()
     np.testing.assert_allclose(level_axes(-9.81 * way), turn[:, :2], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(level_axes((-9.81 * way).astype(np.float32)), turn[:, :2], rtol=0, atol=1e-5)
     model = eqx.tree_at(lambda m: m.gravity, load_urdf(fj.DEMO), jnp.asarray(-9.81 * way))
     told = find("gravity_tilt")(np.zeros(0, int), **{"x": 0.05, "y": -0.03})
     tilted = np.asarray(told.change(model).gravity)
     angles = told.physical()
     lean = Rotation.from_rotvec(turn[:, 0] * angles["about_x"] + turn[:, 1] * angles["about_y"]).as_matrix()
     np.testing.assert_allclose(tilted, lean.T @ np.asarray(model.gravity), rtol=0, atol=2e-4)  # second order
+
+
+@pytest.mark.parametrize("gravity", [(0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (0.0, 0.0, -9.81)])
+def test_axes_of_a_tilt_have_gradients_without_gravity_and_under_a_ceiling(gravity: tuple[float, ...]) -> None:
+    slopes = jax.jacfwd(level_axes)(jnp.asarray(gravity)), jax.jacrev(level_axes)(jnp.asarray(gravity))
+    assert all(bool(jnp.isfinite(slope).all()) for slope in slopes)
+    np.testing.assert_allclose(level_axes(np.zeros(3)), np.eye(3)[:, :2], rtol=0, atol=0)
 
 
 TORQUES = [n for n, e in CATALOGUE.items() if e.has("torque") or e.has("change") or e.has("torque_error")]

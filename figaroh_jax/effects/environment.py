@@ -55,9 +55,9 @@ def level_axes(gravity: Float[ArrayLike, "3"]) -> Float[Array, "3 2"]:
     With up u = -g / |g|: $e_i - u_i (e_z + u) / (1 + u_z)$ (Rodrigues' formula); where z points down, x and -y.
     """
     g = jnp.asarray(gravity)
-    size = jnp.linalg.norm(g)
-    up = jnp.where(size > 0, -g / jnp.where(size > 0, size, 1.0), jnp.array([0.0, 0.0, 1.0], g.dtype))
-    down = up[2] < -1 + 1e-9
+    square = g @ g  # where there is none, z is up; and no gradient is NaN
+    up = jnp.where(square > 0, -g / jnp.sqrt(jnp.where(square > 0, square, 1.0)), jnp.array([0.0, 0.0, 1.0], g.dtype))
+    down = 1 + up[2] < 1e-6
     turned = jnp.eye(3, dtype=g.dtype)[:, :2] - jnp.outer(up.at[2].add(1.0), up[:2]) / jnp.where(down, 1.0, 1 + up[2])
     return jnp.where(down, jnp.array([[1.0, 0.0], [0.0, -1.0], [0.0, 0.0]], g.dtype), turned)
 
