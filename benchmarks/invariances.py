@@ -34,6 +34,7 @@ Arrays = list[dict[str, np.ndarray]]
 Case = tuple[dict[str, Any], Arrays, str]  # task, arrays of its files, the robot's URDF
 HEAD = "| way | verdict | held out | causes | same | only here | lost | largest difference |\n" + "|---" * 8 + "|"
 TURNED = "turned with gravity"
+EPOCH = 1.7e9  # s
 TURN = (0.5, -0.4, 1.1)  # rad, roll, pitch and yaw of the base
 
 
@@ -144,9 +145,12 @@ def _epoch(task: dict[str, Any], arrays: Arrays, urdf: str) -> Case:
     entries, told = [], []
     for entry, own in zip(task["data"], arrays, strict=True):
         t = own["t"] if "t" in own else np.arange(len(own["q"])) / entry["rate"]
-        told.append(own | {"t": t + 1.7e9})
+        told.append(own | {"t": t + EPOCH})
         entries.append({key: value for key, value in entry.items() if key != "rate"} | {"time": "t"})
-    return task | {"data": entries}, told, urdf
+    task = task | {"data": entries}
+    if "window" in task["preprocess"]:  # it is by the stamps
+        task["preprocess"] = task["preprocess"] | {"window": [edge + EPOCH for edge in task["preprocess"]["window"]]}
+    return task, told, urdf
 
 
 def _single(task: dict[str, Any], arrays: Arrays, urdf: str) -> Case:
