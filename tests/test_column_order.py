@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import yaml
 import figaroh_jax as fj
 from figaroh_jax.cli import main
 from figaroh_jax.diagnosis.problem import Part
+from figaroh_jax.effects.kinematic import CATALOGUE as POSES
 from figaroh_jax.formats.urdf import load_urdf
 
 DEMO = Path(fj.DEMO).parent
@@ -89,3 +91,97 @@ def test_what_is_missing_does_not_depend_on_the_order_of_columns(order: list[str
     assert names["turned"] == order != names["tree"]
     for name in order:
         assert turned["holdout"]["joints"][name] == pytest.approx(as_it_is["holdout"]["joints"][name], rel=1e-6, abs=0)
+
+
+ARM = [f"arm_left_{k}_joint" for k in range(1, 8)]
+SEEN = {"base_frame": "torso_2_link", "tool_frame": "gripper_left_base_link"}
+
+
+def _arm(data_dir: Path, names: list[str], rng: np.random.Generator, postures: int) -> tuple[np.ndarray, Callable]:
+    """Positions of TALOS's left arm, columns as `names`, and Pinocchio's pose of the tool where they stand so."""
+    their = pin.buildModelFromUrdf(str(data_dir / robots.REAL["talos"]))
+    state = their.createData()
+    at = [their.joints[their.getJointId(name)] for name in names]
+    low, high = (
+        np.array([limit[j.idx_q] for j in at]) for limit in (their.lowerPositionLimit, their.upperPositionLimit)
+    )
+    frames = [their.getFrameId(SEEN[key]) for key in ("base_frame", "tool_frame")]
+
+    def pose(position: np.ndarray) -> np.ndarray:
+        q = pin.neutral(their)
+        q[[j.idx_q for j in at]] = position
+        pin.framesForwardKinematics(their, state, q)
+        base, tool = (state.oMf[k].homogeneous for k in frames)
+        return np.linalg.inv(base) @ tool
+
+    return rng.uniform(low, high, (postures, len(names))), pose
+
+
+def test_effects_of_postures_act_at_the_joints_of_the_recording(data_dir: Path) -> None:
+    """Where the tool stands while a sensor reads wrong, beside Pinocchio; a random order of the joints."""
+    rng = np.random.default_rng()
+    names = [str(n) for n in rng.permutation(ARM)]
+    q, pose = _arm(data_dir, names, rng, 20)
+    robot = fj.load_urdf(data_dir / robots.REAL["talos"], joints=names)
+    gear, scaled, ahead, behind = (str(n) for n in rng.permutation(ARM)[:4])
+    place = {name: names.index(name) for name in ARM}
+    offset = {"sine": 0.03, "cosine": -0.02, "order": 3.0}
+    effects = (
+        fj.place(fj.CATALOGUE["encoder_scale"], robot, [scaled], scale=0.04),
+        fj.place(POSES["gear_transmission_error"], robot, [gear], **offset),
+        fj.place(POSES["joint_coupling"], robot, [ahead, behind], ratio=0.05),
+        fj.place(POSES["settling"], robot, amount=0.1),
+    )
+    true, before = q.copy(), np.vstack([q[:1], q[:-1]])
+    true[:, place[scaled]] -= 0.04 * q[:, place[scaled]]
+    angle = 3.0 * q[:, place[gear]]
+    true[:, place[gear]] -= 0.03 * np.sin(angle) - 0.02 * np.cos(angle)
+    true[:, place[behind]] -= 0.05 * q[:, place[ahead]]
+    true -= 0.1 * (q - before)
+    run = fj.postures(q=q, pose=np.array([pose(x) for x in true]), unknown=(), **SEEN)
+    rows = np.asarray(fj.pose_data(robot, run)[0].residual(fj.extend(robot, *effects)))
+    np.testing.assert_allclose(rows, 0.0, rtol=0, atol=1e-12)
+
+
+def test_a_bent_link_is_that_of_the_recording(data_dir: Path) -> None:
+    """An effect with a twist: the same poses whatever the order of the joints."""
+    rng = np.random.default_rng()
+    q, pose = _arm(data_dir, ARM, rng, 10)
+    run = {"pose": np.array([pose(x) for x in q]), "unknown": (), **SEEN}
+    told = []
+    for names in (ARM, ARM[::-1]):
+        robot = fj.load_urdf(data_dir / robots.REAL["talos"], joints=names)
+        effect = fj.place(POSES["link_compliance"], robot, ["arm_left_2_joint"], first=1e-3, second=-2e-3)
+        seen = fj.postures(q=q[:, [ARM.index(n) for n in names]], **run)
+        told.append(np.asarray(fj.pose_data(robot, seen)[0].residual(fj.extend(robot, effect))))
+    assert np.abs(told[0]).max() > 1e-3
+    np.testing.assert_allclose(told[1], told[0], rtol=0, atol=1e-12)
+
+
+def test_a_calibration_names_the_joint_of_the_recording(data_dir: Path, tmp_path: Path) -> None:
+    """A gear error hidden at a joint by Pinocchio; columns in a random order."""
+    rng = np.random.default_rng()
+    names = [str(n) for n in rng.permutation(ARM)]
+    while names in (ARM, ARM[::-1]):
+        names = [str(n) for n in rng.permutation(ARM)]
+    q, pose = _arm(data_dir, names, rng, 150)
+    hidden = str(rng.choice(ARM[1:5]))
+    true = q.copy()
+    true[:, names.index(hidden)] += 4e-3 * np.sin(4.0 * q[:, names.index(hidden)])
+    seen = np.array([pose(x) for x in true])
+    seen[:, :3, 3] += 1e-4 * rng.normal(size=(len(q), 3))
+    seen[:, :3, :3] = [R @ pin.exp3(2e-4 * rng.normal(size=3)) for R in seen[:, :3, :3]]
+    np.savez(tmp_path / "poses.npz", q=q, m=seen)
+    task = {
+        "robot": {"model": str(data_dir / robots.REAL["talos"]), "joints": names},
+        "data": [{"file": "poses.npz", "position": "q", "measurement": {"pose": "m", **SEEN, "unknown": []}}],
+    }
+    (tmp_path / "task.yaml").write_text(yaml.safe_dump(task))
+    assert main(["calibrate", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    told = json.loads((tmp_path / "run" / "result.json").read_text())
+    (cause,) = [c for c in told["causes"] if c["effect"] != "joint_offset"]
+    assert (cause["effect"], cause["at"]) == ("gear_transmission_error", [hidden])
+    assert cause["parameters"]["order"]["value"] == pytest.approx(4.0, rel=0, abs=0.1)
+    assert np.hypot(*(cause["parameters"][k]["value"] for k in ("sine", "cosine"))) == pytest.approx(
+        4e-3, rel=0.1, abs=0
+    )

@@ -171,12 +171,14 @@ class Run:
         self.used = everything & ~np.isin(measured.posture, list(sizes))
         if sizes:
             choice = levels.choose(measured, self.used, self.effects, self.level)
-        validating = lambda share: self.progress("validating", 0.3 + 0.5 * share)  # noqa: E731
-        folds = levels.nested(measured, self.used, self.effects, self._extended, self.level, validating)
-        self.choice, self.folds = _never_worse(choice, folds)
-        if self.level not in (None, self.choice.level):
-            self.notes.append(f"the requested level {self.level} predicts no better than the frames alone")
-            self.choice, self.folds = choice, folds
+        # of frames alone that were chosen by all rows a fold is one too
+        self.choice, self.folds = choice, self._validated("frames" if choice.level == "frames" else self.level)
+        if choice.level != "frames" and not _better_than_frames(self.folds):
+            if self.level is None:
+                self.choice = levels.choose(measured, self.used, self.effects, "frames")
+                self.folds = self._validated("frames")
+            else:
+                self.notes.append(f"the requested level {self.level} predicts no better than the frames alone")
         recurring = _recurring(self.choice, self.folds, self.blocks)
         self.named = [k for k in recurring if self.blocks[k].effect is not HISTORY]
         self.history = len(self.named) < len(recurring)
@@ -186,6 +188,11 @@ class Run:
         self.extension = self._refined()
         self.fit = self._fit(self.choice.level, self.extension)
         return self._result()
+
+    def _validated(self, level: str | None) -> list[levels.Fold]:
+        """The outer folds, each with its own choice, or of its own effects beside the given level."""
+        progress = lambda share: self.progress("validating", 0.3 + 0.5 * share)  # noqa: E731
+        return levels.nested(self.measured, self.used, self.effects, self._extended, level, progress)
 
     def _extended(self, choice: levels.Choice, rows: Bool[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
         """Residual of all rows for a choice with its effects fitted to `rows`, to first order about its level's fit."""
@@ -341,14 +348,11 @@ def _recurring(choice: levels.Choice, folds: Sequence[levels.Fold], blocks: Sequ
     ]
 
 
-def _never_worse(choice: levels.Choice, folds: list[levels.Fold]) -> tuple[levels.Choice, list[levels.Fold]]:
-    """The frames alone where the choice, made inside the outer folds, predicts no better than they do."""
+def _better_than_frames(folds: Sequence[levels.Fold]) -> bool:
+    """Whether what was chosen inside the outer folds predicts them better than base and tool frames alone."""
     frames, chosen = levels.pooled([f.levels["frames"] for f in folds]), levels.pooled([f.plain for f in folds])
     ratio = [c / f for f, c in zip(frames, chosen, strict=True) if np.isfinite(f) and f > 0.0]
-    if choice.level != "frames" and ratio and np.mean(ratio) < 1.0:
-        return choice, folds
-    plain = [f._replace(plain=f.levels["frames"], chosen=f.levels["frames"]) for f in folds]
-    return choice._replace(level="frames", effects=(), rivals=()), plain
+    return bool(ratio) and np.mean(ratio) < 1.0
 
 
 def _table(folds: Sequence[levels.Fold], effects: bool) -> dict[str, tuple[float, float]]:

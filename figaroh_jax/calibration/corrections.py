@@ -85,7 +85,7 @@ def solution_of(
     scale = np.asarray(final.problem.scale)
     each = [(c.label, c.unit) for c in final.columns] + list(final.own)
     kept = np.array([k for k in np.flatnonzero(free) if each[k][0]], int)  # empty columns have no name
-    names, units = zip(*(each[k] for k in kept), strict=True)
+    names, units = (tuple(each[k][place] for k in kept) for place in (0, 1))
     covariance = (marginal.honest_covariance(posterior, linear.prior) * scale[:, None] * scale)[np.ix_(kept, kept)]
     weight = np.where(linear.posture >= 0, posterior.weight[linear.posture], 1.0)
     weight = np.where(used, np.sqrt(weight) / posterior.noise[linear.channel], 0.0)
@@ -125,7 +125,7 @@ def _effects_of(model: RobotModel, final: Measured, at: np.ndarray, named: Seque
     size = dict(zip((c.label for c in final.columns), at * np.asarray(final.problem.scale), strict=False))
     for block in named:
         if block.effect.has("position_error"):
-            joints = np.array([model.joint_index(name) for name in block.columns[0].at], int)
+            joints = np.array([model.joints[model.tree_index(name)].coordinate for name in block.columns[0].at], int)
             values = {c.parameter: np.float64(block.effect.correction * size[c.label]) for c in block.columns}
             curved = shape_of(block.effect)[0]
             yield block.effect(joints, **values, **({curved: np.float64(block.shape)} if curved else {}))

@@ -124,8 +124,8 @@ def playing_joints(
     found = []
     for way in (np.zeros(len(linear.residual)), *ways.T):
         U = np.column_stack([turned, way[rows] / noise[rows]])
-        size = np.array([np.sqrt(np.mean(U[:, groups == g] ** 2)) for g in range(3)])
-        U = U / np.where(size > 0.0, size, 1.0)[groups]
+        size = np.array([np.sqrt(np.mean(U[:, groups == g] ** 2)) for g in groups])
+        U = U / np.where(size > 0.0, size, 1.0)
         A, b = np.array([U[p].T @ U[p] for p in parts]), np.array([U[p].T @ e[p] for p in parts])
         found.append(_likelihood(A, b, float(e @ e), len(e), groups))
     best = max(found[1:])

@@ -71,7 +71,7 @@ def _sharpest(model: RobotModel, postures: Sequence[Postures], block: Block, tak
     low, high = grid[max(place - 1, 0)], grid[min(place + 1, len(grid) - 1)]
     if block.reach:
         low, high = block.shape - block.reach, block.shape + block.reach
-    at = tuple(model.joint_index(name) for name in block.columns[0].at)
+    at = tuple(model.tree_index(name) for name in block.columns[0].at)
 
     def moved(shape: float) -> Block:
         columns = columns_of(block.effect, model, at, shape)

@@ -114,13 +114,18 @@ class Motion(eqx.Module):
     @property
     def angle(self) -> Float[Leaf, "samples nv"]:
         """Position of each coordinate, rad or m; zero where no one number tells it (joints of several axes)."""
+        return self.by_coordinate(self.position)
+
+    def by_coordinate(self, numbers: Float[Leaf, "samples nq"]) -> Float[Leaf, "samples nv"]:
+        """Numbers of q by the columns of v; zero for joints of several axes."""
+        space: Any = np if isinstance(numbers, np.ndarray) else jnp  # on the host it costs no program
         if self.model.nq == len(self.model.joint_names):
-            return self.position if isinstance(self.position, np.ndarray) else jnp.asarray(self.position)
+            return space.asarray(numbers)
         column = np.full(self.model.nv, -1)
         for joint, at in zip(self.model.joints, self.model.dofs.positions, strict=True):
             if joint.kind in ("revolute", "prismatic"):
                 column[joint.coordinate] = at.start
-        return jnp.where(column < 0, 0.0, jnp.asarray(self.position)[:, column])
+        return space.where(column < 0, 0.0, space.asarray(numbers)[:, column])
 
     @property
     def begins(self) -> Bool[Array, " samples"]:

@@ -56,13 +56,15 @@ class Postures:
     payload: Float[Leaf, "samples nj"]  # as torque, of the carried load alone
     time: Float[Leaf, " samples"]  # s
     duration: float  # s, of all recordings together
-    _motions: dict[int, PostureMotion] = field(default_factory=dict, init=False, repr=False)  # by robot
+    _motions: dict[tuple[int, int], PostureMotion] = field(default_factory=dict, init=False, repr=False)
 
-    def motion(self, model: RobotModel) -> PostureMotion:
-        """The postures as effects see them, made once."""
-        if id(model) not in self._motions:
-            self._motions[id(model)] = PostureMotion.of(model, self)
-        return self._motions[id(model)]
+    def motion(self, model: RobotModel, joint: int) -> PostureMotion:
+        """The postures as an effect at a tree joint sees them, made once: a joint that follows another has a load of
+        its own."""
+        key = id(model), joint if model.joints[joint].follows else -1
+        if key not in self._motions:
+            self._motions[key] = PostureMotion.of(model, self, joint)
+        return self._motions[key]
 
 
 class Column(NamedTuple):
@@ -194,33 +196,28 @@ def _library(array: Any) -> Any:
 
 
 class PostureMotion(Motion):
-    """Postures as the effects see a motion: at rest, each with the one before; columns are tree joints."""
+    """Postures as the effects see a motion: at rest, each with the one before."""
 
     before: Float[Leaf, "samples nq"]
     payload: Float[Leaf, "samples nv"]  # what the carried load adds to `load`, N m or N
 
     @classmethod
-    def of(cls, model: RobotModel, postures: Postures) -> PostureMotion:
-        """The postures of a recording; the drives hold against gravity."""
-        load = -postures.torque
-        rest = np.zeros_like(load)
+    def of(cls, model: RobotModel, postures: Postures, joint: int) -> PostureMotion:
+        """The postures of a recording; the drives hold against gravity. In the column of the tree joint at hand stands
+        its own load, in each other one that of its independent joint."""
+        own = _tree_joints(model) | {model.joints[joint].coordinate: joint}
+        load, payload = np.zeros((2, len(postures.q), model.nv))
+        for by_column, by_joint in ((load, postures.torque), (payload, postures.payload)):
+            if by_joint.shape[1]:  # else none is known
+                by_column[:, list(own)] = -by_joint[:, list(own.values())]
+        rest, width = np.zeros_like(load), np.zeros(model.nv)
         time = postures.time if len(postures.time) == len(postures.q) else np.zeros(len(postures.q))
-        width = np.zeros(load.shape[1])
-        return cls(model, time, postures.q, rest, rest, load, load, 0.0, width, postures.before, -postures.payload)
+        return cls(model, time, postures.q, rest, rest, load, load, 0.0, width, postures.before, payload)
 
     @property
-    def angle(self) -> Float[Leaf, "samples nj"]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Position of each tree joint, rad or m."""
-        return self.position[:, self._starts]
-
-    @property
-    def way(self) -> Float[Leaf, "samples nj"]:
-        """Motion of each tree joint from the posture before, rad or m."""
-        return (self.position - self.before)[:, self._starts]
-
-    @property
-    def _starts(self) -> list[int]:
-        return [at.start for at in dofs(self.model.joints).positions]
+    def way(self) -> Float[Leaf, "samples nv"]:
+        """Motion of each coordinate from the posture before, rad or m."""
+        return self.by_coordinate(self.position - self.before)
 
 
 @register
@@ -327,7 +324,7 @@ class Settling(Effect):
     separated_by = "the same postures in another order, and with a longer wait"
     amount: Scalar = amplitude("")
 
-    def position_error(self, motion: Any) -> Float[Leaf, "samples nj"]:
+    def position_error(self, motion: Any) -> Float[Leaf, "samples nv"]:
         """A share of the way from the posture before, in all joints (samples, joints), rad: reading minus truth."""
         return self.amount * motion.way
 
@@ -427,11 +424,16 @@ def twists_of(effects: Sequence[Effect], model: RobotModel, postures: Postures) 
         sizes = [getattr(effect, name) for name in effect.amplitudes()]
         if sizes and effect.has("twist"):
             curved = getattr(effect, shape_of(type(effect))[0], 0.0)
-            columns = effect.twist(model, tuple(int(k) for k in effect.at), curved)
+            columns = effect.twist(model, tuple(_tree_joints(model)[int(k)] for k in effect.at), curved)
             for size, (_, _, pieces) in zip(sizes, columns, strict=True):
                 for joint, field in pieces:
                     total = total.at[joint].add(size * field(postures))
     return total
+
+
+def _tree_joints(model: RobotModel) -> dict[int, int]:
+    """Tree joint of each coordinate, by its first column of v."""
+    return {joint.coordinate: k for k, joint in enumerate(model.joints) if not joint.follows}
 
 
 def _shifts(
@@ -439,10 +441,11 @@ def _shifts(
 ) -> Iterator[tuple[str, str, Sequence[tuple[int, Callable]]]]:
     """Twists along the joints' own motions: what a reading with the effect has to be moved by to be true."""
     joints = at[-1:] if at else tuple(range(len(model.joints)))
+    columns = tuple(model.joints[j].coordinate for j in at)  # of v, as every effect has its place
     unit_shape = {shape_of(effect)[0]: shape} if shape_of(effect)[0] else {}
     for name, parameter in effect.parameters().items():
         if parameter.linear:
-            one = partial(_sized, effect, at, **{name: effect.correction}, **unit_shape)
+            one = partial(_sized, effect, columns, **{name: effect.correction}, **unit_shape)
             unit = joint_unit(parameter.unit or "1", bool(at) and model.joints[at[-1]].kind != "revolute")
             yield name, unit, [(j, _shift(model, j, one)) for j in joints]
 
@@ -468,7 +471,8 @@ def _shift(
 
     def field(postures: Postures) -> Float[np.ndarray, "6 samples"]:
         made = one()
-        error = np.asarray(type(made).position_error(made, postures.motion(model)))  # a bound method is a module too
-        return -motion[:, None] * (error if error.ndim == 1 else error[:, joint])
+        seen = postures.motion(model, joint)
+        error = np.asarray(type(made).position_error(made, seen))  # a bound method is a module too
+        return -motion[:, None] * (error if error.ndim == 1 else error[:, model.joints[joint].coordinate])
 
     return field

@@ -206,12 +206,15 @@ def _gained(calibration: Calibration) -> str:
     if error is None:
         return "nothing was measured"
     before, after = (_with_unit(number(x, 3), error.unit) for x in (error.validated_before, error.validated_after))
-    if calibration.level == "frames":
-        return (
-            f"No correction of the robot predicts better than the nominal kinematics with base and tool frames fitted:"
-            f" {after} on held-out postures."
-        )
+    effects = any(c.name.effect not in ("joint_offset", "outlier") for c in calibration.causes)
     found = level(calibration.level)
+    if calibration.level == "frames":
+        nominal = (
+            "No correction of the robot predicts better than the nominal kinematics with base and tool frames fitted"
+        )
+        if not effects:
+            return f"{nominal}: {after} on held-out postures."
+        found = "the nominal geometry and what is named"
     told = f"the error on held-out postures falls from {before} (base and tool frames only) to {after}"
     if not error.validated_after < error.validated_before:
         told = f"the error on held-out postures is {after}, no less than with base and tool frames only ({before})"

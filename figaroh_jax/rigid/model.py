@@ -178,6 +178,10 @@ class RobotModel(eqx.Module):
             raise InputError(f"joint '{name}' of robot '{self.name}' has {len(several)} columns: {', '.join(several)}")
         return _index(name, self.dof_names, "joint", self.name)
 
+    def tree_index(self, name: str) -> int:
+        """Tree index of the joint called `name`, mimic joints among them; raises `InputError` with the nearest name."""
+        return _index(name, tuple(joint.name for joint in self.joints), "joint", self.name)
+
     def link_index(self, name: str) -> int:
         """Tree index of the link called `name`; raises `InputError` with the nearest known name."""
         return _index(name, self.link_names, "link", self.name)
