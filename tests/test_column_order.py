@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
@@ -94,7 +95,7 @@ def test_what_is_missing_does_not_depend_on_the_order_of_columns(order: list[str
 
 
 ARM = [f"arm_left_{k}_joint" for k in range(1, 8)]
-SEEN = {"base_frame": "torso_2_link", "tool_frame": "gripper_left_base_link"}
+SEEN: dict[str, Any] = {"base_frame": "torso_2_link", "tool_frame": "gripper_left_base_link"}
 
 
 def _arm(data_dir: Path, names: list[str], rng: np.random.Generator, postures: int) -> tuple[np.ndarray, Callable]:
@@ -147,7 +148,7 @@ def test_a_bent_link_is_that_of_the_recording(data_dir: Path) -> None:
     """An effect with a twist: the same poses whatever the order of the joints."""
     rng = np.random.default_rng()
     q, pose = _arm(data_dir, ARM, rng, 10)
-    run = {"pose": np.array([pose(x) for x in q]), "unknown": (), **SEEN}
+    run: dict[str, Any] = {"pose": np.array([pose(x) for x in q]), "unknown": (), **SEEN}
     told = []
     for names in (ARM, ARM[::-1]):
         robot = fj.load_urdf(data_dir / robots.REAL["talos"], joints=names)

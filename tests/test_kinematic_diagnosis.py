@@ -126,6 +126,36 @@ def test_frames_may_all_be_known(folder: Path):
     assert found.after[0] < 0.02 * found.before[0]
 
 
+def test_an_effect_beside_a_geometry_that_is_right_is_named(folder: Path):
+    """The links stand exactly where the file says: frames alone are the level, and what is beside them stays."""
+    bench = study()
+    arm = bench.arm("arm6", folder)
+    case = postures.hide(arm, "gear_transmission_error", 10.0, np.random.default_rng(), off=0.0)
+    found = bench.diagnose(arm, case)
+    assert (bench.grade(case, found), found.verdict) == ("right", "named"), (case.right, found.causes)
+
+
+def test_a_robot_that_is_right_and_stands_where_it_is_said_to_has_nothing_to_fit(folder: Path):
+    """Known frames, exact links: not one unknown is left, and that is no error."""
+    arm = study().arm("arm6", folder)
+    rng = np.random.default_rng()
+    q = poses.postures(rng, 40)
+    seen = postures.as_seen([pose for pose in _exact(arm, q)], rng)
+    case = postures.Hidden("nothing", frozenset(), (), (postures.Recording(np.arange(40.0), q, seen, False),))
+    found = study().diagnose(arm, case)
+    assert found.causes == () and found.calibration.solution.free.names == ()
+
+
+def _exact(arm: Any, q: np.ndarray) -> list[pin.SE3]:
+    """Tool in the base frame, by the file."""
+    data, base, tool = arm.robot.createData(), *(arm.robot.getFrameId(name) for name in (arm.base, arm.tool))
+    found = []
+    for x in q:
+        pin.framesForwardKinematics(arm.robot, data, x)
+        found.append(data.oMf[base].inverse() * data.oMf[tool])
+    return found
+
+
 def test_a_robot_that_is_slack_gets_no_joint_offsets(folder: Path):
     """What is named predicts postures that were held out better than the frames alone; here offsets do not."""
     arm = study().arm("arm6", folder)

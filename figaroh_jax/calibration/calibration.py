@@ -352,7 +352,7 @@ def _better_than_frames(folds: Sequence[levels.Fold]) -> bool:
     """Whether what was chosen inside the outer folds predicts them better than base and tool frames alone."""
     frames, chosen = levels.pooled([f.levels["frames"] for f in folds]), levels.pooled([f.plain for f in folds])
     ratio = [c / f for f, c in zip(frames, chosen, strict=True) if np.isfinite(f) and f > 0.0]
-    return bool(ratio) and np.mean(ratio) < 1.0
+    return bool(ratio) and bool(np.mean(ratio) < 1.0)
 
 
 def _table(folds: Sequence[levels.Fold], effects: bool) -> dict[str, tuple[float, float]]:
