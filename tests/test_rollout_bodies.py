@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -198,22 +199,26 @@ def test_identify_tells_the_links_that_a_task_names(tmp_path: Path):
     np.testing.assert_allclose(result["fit"]["rms"], NOISE, atol=0.1 * NOISE)
 
 
+def _told_of_the_double_pendulum(folder: Path, held: tuple[int, ...]) -> dict[str, Any]:
+    """The answer by six recordings, some of them `held` out."""
+    own = DATA / "dfki_double_pendulum"
+    data = [
+        {"file": str(f), "time": "t", "command": "tau", "position": "q", "role": "holdout" if k in held else "fit"}
+        for k, f in enumerate(sorted(own.glob("C1_*.npz"))[:6])
+    ]
+    task = {
+        "robot": {"model": str(own / "double_pendulum_C1.urdf")}, "data": data, "rollout": {"window": 0.3},
+        "actuator": {"Joint1": {"kind": "torque"}, "Joint2": {"kind": "torque"}},
+    }  # fmt: skip
+    (folder / "task.yaml").write_text(json.dumps(task))
+    main(["diagnose", str(folder / "task.yaml"), "--out", str(folder / "out"), "--quiet"])
+    return json.loads((folder / "out" / "answer.json").read_text())
+
+
 @pytest.mark.skipif(not (DATA / "dfki_double_pendulum").is_dir(), reason="FIGAROH_JAX_DATA is not there")
 def test_the_real_double_pendulum_has_its_inertia_about_its_joints(tmp_path: Path):
     """The set's own identified parameters (I1, I2 about the joints) stand in its URDF as about the centres of mass."""
-    folder = DATA / "dfki_double_pendulum"
-    files = sorted(folder.glob("C1_*.npz"))[:6]
-    data = [
-        {"file": str(f), "time": "t", "command": "tau", "position": "q", "role": "holdout" if k == 5 else "fit"}
-        for k, f in enumerate(files)
-    ]
-    task = {
-        "robot": {"model": str(folder / "double_pendulum_C1.urdf")}, "data": data, "rollout": {"window": 0.3},
-        "actuator": {"Joint1": {"kind": "torque"}, "Joint2": {"kind": "torque"}},
-    }  # fmt: skip
-    (tmp_path / "task.yaml").write_text(json.dumps(task))
-    main(["diagnose", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "out"), "--quiet"])
-    answer = json.loads((tmp_path / "out" / "answer.json").read_text())
+    answer = _told_of_the_double_pendulum(tmp_path, held=(5,))
     assert answer["verdict"] == "named+rest"
     told = {tuple(c["at"]): c for c in answer["causes"] if c["effect"] == "link_inertia"}
     assert set(told) == {("Link1",), ("Link2",)}
@@ -222,6 +227,15 @@ def test_the_real_double_pendulum_has_its_inertia_about_its_joints(tmp_path: Pat
     assert sum("about the joint" in note for note in answer["notes"]) == 2
     assert answer["holdout"]["after"] < 0.5 * answer["holdout"]["before"]
     assert sum("judged in windows of 0.3 s" in note for note in answer["notes"]) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (DATA / "dfki_double_pendulum").is_dir(), reason="FIGAROH_JAX_DATA is not there")
+def test_links_that_too_few_recordings_bear_out_are_what_came_nearest(tmp_path: Path):
+    answer = _told_of_the_double_pendulum(tmp_path, held=(2, 5))
+    nearest = {tuple(one["at"]): one for one in answer["rest"]["nearest"] if one["effect"] == "link_inertia"}
+    assert answer["verdict"] == "unknown" and set(nearest) == {("Link1",), ("Link2",)}
+    assert {one["why_not"] for one in nearest.values()} == {"not as good in all recordings"}
 
 
 def test_windows_of_a_robot_that_nothing_brings_back_begin_where_it_was_measured(tmp_path: Path):

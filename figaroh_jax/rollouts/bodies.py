@@ -73,9 +73,9 @@ def searched_with_bodies(
     plain = _rigid(here, found)
     sound = replace(before, loop=plain.structure.loop)
     whole = with_bodies(sound, range(len(sound.loop.robot.joints)))
-    links, model = _links(thinned(whole), plain)
+    links, model, missed = _links(thinned(whole), plain)
     if not links:
-        return found
+        return replace(found, nearest=[*missed, *found.nearest])
     some = _freed(sound, whole, plain, links, model)
     other = seek(some, progress, forbid=forbid)
     if not np.isfinite(other.last.cost) or len(other.structure.table) != len(some.known.table):
@@ -166,8 +166,8 @@ class _Look:
         return {k for k, share in left if share < _NO_OTHER}
 
 
-def _links(here: Setting, found: _Rigid) -> tuple[list[Link], Standing]:
-    """The links whose inertia recordings left out bear out, and the model with them.
+def _links(here: Setting, found: _Rigid) -> tuple[list[Link], Standing, list[tuple[Name, float, str]]]:
+    """The links whose inertia recordings left out bear out, the model with them, and else what came nearest.
 
     Links come in one after another while each takes much of what is left, those that the others can spare go again: no
     link by itself may predict better where several are wrong.
@@ -183,12 +183,18 @@ def _links(here: Setting, found: _Rigid) -> tuple[list[Link], Standing]:
         if best is None:
             break
         steps.append(best)
+    missed: list[tuple[Name, float, str]] = []
     for links, model in reversed(steps[1:]):  # fewer where no bodies have what all of them would
         links, model = _told_further(here, now, model, links)
         new = _stands_as_bodies(here, now, model, links)
-        if new is not None and borne_out(here, now, new, MOST_OF_A_REST)[2]:
-            return _needed(here, now, links, new)
-    return [], now
+        gain, _, enough = (0.0, 0.0, False) if new is None else borne_out(here, now, new, MOST_OF_A_REST)
+        if new is not None and enough:
+            return *_needed(here, now, links, new), []
+        if gain > GAIN_BESIDE_REST and not missed:
+            alone = gain > MOST_OF_A_REST and by_recording(here)
+            why = "not as good in all recordings" if alone else "improves held-out data too little"
+            missed = [(Name(EFFECT, (loop.robot.link_names[link.at],)), gain, why) for link in links]
+    return [], now, missed
 
 
 def _needed(here: Setting, now: Standing, links: list[Link], new: Standing) -> tuple[list[Link], Standing]:
