@@ -173,10 +173,9 @@ class Run:
             choice = levels.choose(measured, self.used, self.effects, self.level)
         # of frames alone that were chosen by all rows a fold is one too
         self.choice, self.folds = choice, self._validated("frames" if choice.level == "frames" else self.level)
-        if choice.level != "frames" and not _better_than_frames(self.folds):
+        if choice.level != "frames" and not _better(self.folds, "plain", self.folds, "frames"):
             if self.level is None:
-                self.choice = levels.choose(measured, self.used, self.effects, "frames")
-                self.folds = self._validated("frames")
+                self._or_frames_alone()
             else:
                 self.notes.append(f"the requested level {self.level} predicts no better than the frames alone")
         recurring = _recurring(self.choice, self.folds, self.blocks)
@@ -188,6 +187,12 @@ class Run:
         self.extension = self._refined()
         self.fit = self._fit(self.choice.level, self.extension)
         return self._result()
+
+    def _or_frames_alone(self) -> None:
+        """Frames and their own effects, but for effects that predict better beside the level that was chosen."""
+        alone = levels.choose(self.measured, self.used, self.effects, "frames"), self._validated("frames")
+        if not (self.choice.effects and _better(self.folds, "chosen", alone[1], "chosen")):
+            self.choice, self.folds = alone
 
     def _validated(self, level: str | None) -> list[levels.Fold]:
         """The outer folds, each with its own choice, or of its own effects beside the given level."""
@@ -205,12 +210,7 @@ class Run:
         linear = choice.linear
         if self.effects is None or not choice.effects:
             return linear
-        Z = self.effects.jacobian(linear.at, choice.effects)
-        return linear._replace(
-            jacobian=np.hstack([linear.jacobian, Z]),
-            at=np.r_[linear.at, np.zeros(Z.shape[1])],
-            prior=np.r_[linear.prior, np.full(Z.shape[1], levels.EFFECT)],
-        )
+        return levels.widened(linear, self.effects.jacobian(linear.at, choice.effects))
 
     def _refined(self) -> list[Block]:
         """The named effects, each once, with the best value of their shapes."""
@@ -348,10 +348,17 @@ def _recurring(choice: levels.Choice, folds: Sequence[levels.Fold], blocks: Sequ
     ]
 
 
-def _better_than_frames(folds: Sequence[levels.Fold]) -> bool:
-    """Whether what was chosen inside the outer folds predicts them better than base and tool frames alone."""
-    frames, chosen = levels.pooled([f.levels["frames"] for f in folds]), levels.pooled([f.plain for f in folds])
-    ratio = [c / f for f, c in zip(frames, chosen, strict=True) if np.isfinite(f) and f > 0.0]
+def _better(folds: Sequence[levels.Fold], one: str, others: Sequence[levels.Fold], other: str) -> bool:
+    """Whether what the outer folds have as `one` predicts them better than what others have as `other`.
+
+    "plain" is the chosen level, "chosen" that with its effects; else the name of a level.
+    """
+
+    def of(folds: Sequence[levels.Fold], which: str) -> tuple[float, float]:
+        found = [f.levels[which] if which in levels.LEVELS else getattr(f, which) for f in folds]
+        return levels.pooled(found)
+
+    ratio = [a / b for a, b in zip(of(folds, one), of(others, other), strict=True) if np.isfinite(b) and b > 0.0]
     return bool(ratio) and bool(np.mean(ratio) < 1.0)
 
 

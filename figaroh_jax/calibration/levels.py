@@ -183,7 +183,41 @@ def choose(measured: Measured, used: Bool[Array, " rows"], effects: Effects | No
     if effects is None:
         return Choice(best, (), fits, scores)
     chosen, rivals = _forward(measured, used, best, linear, posterior, effects, scores)
+    while chosen and asked is None:  # a large effect hides what the links are off
+        higher = _beside(measured, used, fits, best, effects, chosen)
+        if higher == best:
+            break
+        best = higher
+        chosen, rivals = _forward(measured, used, best, *fits[best], effects, scores)
     return Choice(best, chosen, fits, scores, rivals)
+
+
+def widened(linear: Linear, columns: Float[Array, "rows some"]) -> Linear:
+    """The rows with columns of effects behind the others."""
+    return linear._replace(
+        jacobian=np.hstack([linear.jacobian, columns]),
+        at=np.r_[linear.at, np.zeros(columns.shape[1])],
+        prior=np.r_[linear.prior, np.full(columns.shape[1], EFFECT)],
+    )
+
+
+def _beside(
+    measured: Measured,
+    used: Array,
+    fits: Mapping[str, tuple[Linear, Posterior]],
+    lowest: str,
+    effects: Effects,
+    chosen: Sequence[int],
+) -> str:
+    """The level that predicts best beside effects that were chosen at the `lowest`, to first order about its fit."""
+    best, least = lowest, np.inf
+    for level in LEVELS[LEVELS.index(lowest) :]:
+        linear = fits[level][0]
+        wide = widened(linear, effects.jacobian(linear.at, chosen))
+        score = _held_out(measured, wide, used, marginal.fit(wide, used, free_at(level, wide.prior), robust=True))
+        if score < (1.0 - thresholds.LEVEL_GAIN) * least:
+            best, least = level, score
+    return best
 
 
 def _inner_folds(measured: Measured, used: Array) -> list[tuple[Array, Array]]:
