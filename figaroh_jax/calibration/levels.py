@@ -176,7 +176,8 @@ def choose(measured: Measured, used: Bool[Array, " rows"], effects: Effects | No
         fits[level] = linear, posterior
         if asked is None:
             scores[level] = _held_out(measured, linear, used, posterior)
-            if best is None or scores[level] < (1.0 - thresholds.LEVEL_GAIN) * scores[best]:
+            better = best is None or scores[level] < (1.0 - thresholds.LEVEL_GAIN) * scores[best]
+            if better and (best is None or _room(posterior, used) >= 0.0):
                 best = level
     assert best is not None
     linear, posterior = fits[best]
@@ -214,8 +215,9 @@ def _beside(
     for level in LEVELS[LEVELS.index(lowest) :]:
         linear = fits[level][0]
         wide = widened(linear, effects.jacobian(linear.at, chosen))
-        score = _held_out(measured, wide, used, marginal.fit(wide, used, free_at(level, wide.prior), robust=True))
-        if score < (1.0 - thresholds.LEVEL_GAIN) * least:
+        posterior = marginal.fit(wide, used, free_at(level, wide.prior), robust=True)
+        score = _held_out(measured, wide, used, posterior)
+        if score < (1.0 - thresholds.LEVEL_GAIN) * least and _room(posterior, used) >= 0.0:
             best, least = level, score
     return best
 
@@ -225,6 +227,12 @@ def _inner_folds(measured: Measured, used: Array) -> list[tuple[Array, Array]]:
     inside = np.unique(measured.posture[used & (measured.posture >= 0)])
     folds = [inside[k :: thresholds.FOLDS] for k in range(min(thresholds.FOLDS, len(inside)))]
     return [(used & ~np.isin(measured.posture, fold), fold) for fold in folds]
+
+
+def _room(posterior: Posterior, used: Bool[Array, " rows"]) -> float:
+    """How many more numbers the rows can tell than the fit takes from them; where it takes most, they are hardly held
+    out from one another."""
+    return thresholds.OF_ROWS * float(used.sum()) - posterior.freedom
 
 
 def _held_out(measured: Measured, linear: Linear, used: Array, posterior: Posterior) -> float:
@@ -264,7 +272,7 @@ def _forward(
     def joined(which: Sequence[int]) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...], dict[str, float]]:
         Z = effects.jacobian(linear.at, which)
         folds = [_Inner.make(measured, linear, *one, free, Z) for one in inner]
-        return _joined(folds, effects, which, level)
+        return _joined(folds, effects, which, level, _room(posterior, used))
 
     def shown(beside: Sequence[int]) -> list[int]:
         columns = effects.jacobian(linear.at, beside)
@@ -281,13 +289,17 @@ def _forward(
 
 
 def _joined(
-    folds: Sequence[_Inner], effects: Effects, which: Sequence[int], level: str
+    folds: Sequence[_Inner], effects: Effects, which: Sequence[int], level: str, room: float
 ) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...], dict[str, float]]:
-    """Of the blocks `which`, those that join, what gains nearly as much as each, and the errors on the inner folds."""
+    """Of the blocks `which`, those that join, what gains nearly as much as each, and the errors on the inner folds.
+
+    There is `room` for so many columns.
+    """
     slices, chosen, rivals, scores = effects.slices(which), [], [], {}
     current = _score_of(folds)
     while len(chosen) < thresholds.MOST_EFFECTS:
-        ranked = _screen(folds, slices, chosen)
+        left = room - sum(len(effects.blocks[k]) for k in chosen)
+        ranked = [k for k in _screen(folds, slices, chosen) if len(effects.blocks[k]) <= left]
         trials = {k: _score_of(folds, np.r_[slices[k]]) for k in ranked[:12]}
         best = min(trials, key=lambda k: trials[k] * (1.0 + effects.handicap[k]), default=None)
         if best is None or trials[best] > (1.0 - thresholds.EFFECT_GAIN) * current:

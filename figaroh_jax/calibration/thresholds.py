@@ -7,6 +7,7 @@ __all__: list[str] = []
 FOLDS = 5  # of the postures; each is left out once
 
 # Level and effects of a calibration (`levels`, `calibration`): shares of the error on postures left out
+OF_ROWS = 0.5  # of the measured numbers, that a level and its effects may take up
 LEVEL_GAIN = 0.01  # that a level must take away from the one below it
 EFFECT_GAIN = 0.03  # that an effect must take away to be taken in
 RIVAL = 0.9  # of the best effect's gain: what gains that much is not told apart from it

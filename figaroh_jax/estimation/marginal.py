@@ -104,9 +104,17 @@ def honest_covariance(posterior: Posterior, prior: Int[Array, " unknowns"]) -> F
         gamma = max(float(known[mine].sum()), 0.0)
         wider[mine] *= max(gamma / (gamma + _PSEUDO), 0.25)
     found = np.zeros_like(posterior.covariance)
-    information = _inverse(posterior.covariance[inside]) - np.diag(precision)
+    both = _inverse(posterior.covariance[inside])
+    information = _without_negative(both - np.diag(precision), np.diag(both))  # where the rows tell nothing, rounding
     found[inside] = _inverse(information / posterior.spread + np.diag(wider))
     return found
+
+
+def _without_negative(matrix: Array, diagonal: Array) -> Array:
+    """The matrix without what is negative of it, in units of the roots of a `diagonal`."""
+    root = np.sqrt(diagonal)
+    values, vectors = np.linalg.eigh(matrix / np.outer(root, root))
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(root, root)
 
 
 def _spread_of(whitened: Array, weight: Array, posture: Array, leverage: float) -> float:
