@@ -88,7 +88,7 @@ def diagnose_poses(
         effects = [c for c in calibration.causes if c.name.effect not in (*GEOMETRY, "outlier")]
         play = _play(run, alpha)
         aside: list[tuple[Cause, str]] = []
-        if p_effects > alpha:
+        if p_effects > thresholds.OF_ALPHA * alpha:
             aside += [(c, "noise alone brings such a gain") for c in effects]
             effects = []
         elif play.found:  # a law that leaves its own joint erring at random is not the right one
@@ -349,22 +349,29 @@ def _simplest(scores: Scores) -> int:
 
 
 def _effect_scores(run: Run) -> tuple[float, float]:
-    """p-value of the largest score of an effect beside the level alone, and beside the level with its effects."""
+    """p-value of the largest score of an effect beside the level alone, and beside the level with its effects.
+
+    Of effects that are named beside less than all links also beside all of these: the larger one.
+    """
     if run.effects is None:
         return 1.0, 1.0
     grid = range(run.effects.grid)
     slices = run.effects.slices(grid)
-    linear, posterior = run.choice.fits[run.choice.level]
-    found = []
-    for fit in ((linear, posterior), (run.fit[1], run.fit[2])):
+
+    def p_value(fit: tuple[marginal.Linear, marginal.Posterior], level: str, named: Sequence[int]) -> float:
+        assert run.effects is not None
         at = _without_effects(fit[0], run)
         Z = run.effects.jacobian(at, grid)
-        blocks = [Z[:, s] for k, s in slices.items() if k not in (run.named if fit[0] is run.fit[1] else ())]
-        free = levels.free_at(run.choice.level, fit[0].prior)
+        blocks = [Z[:, s] for k, s in slices.items() if k not in named]
+        free = levels.free_at(level, fit[0].prior)
         tested = Tested(fit[0], row_noise(*fit), run.used, fit[1].precision, free)
         p_grid, p_high = score_blocks(tested, blocks).p_value, score_waves(tested, run.effects.waves(at))
-        found.append(min(p_grid, p_high) if p_high == 1.0 else min(1.0, 2.0 * min(p_grid, p_high)))
-    return found[0], found[1]
+        return min(p_grid, p_high) if p_high == 1.0 else min(1.0, 2.0 * min(p_grid, p_high))
+
+    found = p_value(run.choice.fits[run.choice.level], run.choice.level, ())
+    if run.named and run.choice.level != "full":  # few postures may not tell links that are all a little off
+        found = max(found, p_value(run.choice.fits["full"], "full", ()))
+    return found, p_value((run.fit[1], run.fit[2]), run.choice.level, run.named)
 
 
 class _Play(NamedTuple):

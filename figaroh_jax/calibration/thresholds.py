@@ -30,10 +30,12 @@ OFFSET_SIGMAS = 3.0  # of the estimate and of a good zeroing together
 TOLERANCE = (1e-3, 5e-4)  # rad (or m), m: how well a good robot is zeroed and built, where a task does not say
 TURN = 1e-3  # rad that a link may be turned where it may be shifted by as much as that
 MOST_GEOMETRY = 16  # causes of the geometry
-OF_ALPHA = 1 / 5  # share of the error rate of a task that geometry, play and the rest may each spend
+OF_ALPHA = 1 / 5  # share of the error rate of a task that geometry, effects, play and the rest may each spend
 LOSS_SIGMAS = 1.0  # standard errors by which left-out postures must be worse without a named geometry
 TOLD = 3.0  # logarithm of the odds (20 to 1) by which a correction of the geometry is told from another, or from none
 FAR_OFF = 2.5  # tolerances by which all links are off where a name must be the best of all that there are
-SIZE_SIGMAS = 1.96  # standard deviations by which some amplitude of a named effect must differ from zero
+SIZE_SIGMAS = (
+    3.0  # standard deviations by which some amplitude of a named effect, one of hundreds, must differ from zero
+)
 NOISY = 1.5  # times the device's stated accuracy: the rest is no noise
 WAVE = 1e-2  # chance that noise alone gives the largest wave of any joint, for it to be looked at
