@@ -64,7 +64,7 @@ def test_an_effect_whose_size_may_be_zero_is_no_cause() -> None:
 
     assert not sized(ratio=(-4e-5, 4e-5)) and sized(ratio=(-4e-4, 4e-5))
     assert not sized(sine=(1e-5, 1e-4), cosine=(1e-4, 1e-4), order=(80.0, 0.1))  # an order is no size
-    assert sized(sine=(1e-5, 1e-4), cosine=(3e-4, 1e-4), order=(80.0, 0.1))
+    assert sized(sine=(1e-5, 1e-4), cosine=(4e-4, 1e-4), order=(80.0, 0.1))
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,8 @@ r"""Score tests of blocks of columns against a fit with priors, with the maximum
 
 The fit's rows, whitened, and the rows of its prior stand above each other: $e = (r, \Lambda^{1/2} y)$ is what it
 leaves, M the projector off its columns, $\tilde Z = (Z, 0)$ a block. $Q = |B' e|^2$ with B an orthonormal basis of
-$M \tilde Z$, over the mean square of e; Wilson and Hilferty's cube root puts blocks of different size on one scale.
+$M \tilde Z$, over the mean square of the measured rows of e: links that are better than the prior's width say nothing of
+the noise. Wilson and Hilferty's cube root puts blocks of different size on one scale.
 Two nulls, the larger p counts: e is white, drawn again with its own level; and e of whole postures with their signs
 flipped, which holds where the error of a posture moves all its rows together (play, a slack joint). The largest score
 of all blocks is kept in each draw.
@@ -55,14 +56,14 @@ def score_blocks(fit: Tested, blocks: Sequence[Float[Array, "rows _"]], seed: in
     bases = [_basis(_above(Z[rows] / fit.noise[rows, None], len(e)), basis) for Z in blocks]
     size = np.array([b.shape[1] for b in bases])
     whole = np.hstack(bases) if size.sum() else np.zeros((len(e), 0))
-    level = float(e @ e / freedom)
+    level = float(_measured(e, len(rows)) / freedom)
     q = _sums((whole.T @ e)[None] ** 2, size)[0] / max(level, 1e-300)
     draws = np.random.default_rng(seed).normal(size=(_DRAWS, len(e)))
     z = _scale(q, size)
     top = z.max(initial=-np.inf)
     p_value = 0.0
     for null in (draws, _flipped(e, fit.linear.posture[rows], draws)):
-        square = np.sum(null**2, axis=1) - np.sum((null @ basis) ** 2, axis=1)
+        square = _measured(_off(null, basis, len(rows)), len(rows))
         scores = _sums((null @ whole) ** 2, size) / (square / freedom)[:, None]
         largest = _scale(scores, size).max(axis=1, initial=-np.inf)
         p_value = max(p_value, float((1 + np.sum(largest >= top)) / (_DRAWS + 1)))
@@ -99,7 +100,7 @@ def score_waves(fit: Tested, waves: Iterable[Waves], seed: int = 0) -> float:
     e, basis, freedom = _left(fit, rows)
     draws = np.random.default_rng(seed).normal(size=(_WAVE_DRAWS, len(e)))
     null = _flipped(e, fit.linear.posture[rows], draws)
-    total = np.sum(null**2, axis=1) - np.sum((null @ basis) ** 2, axis=1)
+    total = _measured(_off(null, basis, len(rows)), len(rows))
     count, found, largest, scale = 0, 0.0, np.zeros(_WAVE_DRAWS), fit.noise[rows, None]
     for one in waves:
         sine, cosine = one.columns(fit.linear.posture)
@@ -109,7 +110,7 @@ def score_waves(fit: Tested, waves: Iterable[Waves], seed: int = 0) -> float:
         largest = np.maximum(largest, _taken(null, first, second).max(axis=1, initial=0.0))
     if not count:
         return 1.0
-    share = min(found / float(e @ e), 1.0)
+    share = min(found / float(_measured(e, len(rows))), 1.0)
     white = min(1.0, count * (1.0 - share) ** (0.5 * (freedom - 2)))
     return max(white, float((1 + np.sum(largest / total >= share)) / (_WAVE_DRAWS + 1)))
 
@@ -136,19 +137,21 @@ def waves_shown(
     return [int(waves[k].blocks[best[k]]) for k in shown]
 
 
-def _spectra(fit: Tested, waves: Sequence[Waves], beside: Array) -> list[tuple[Array, int]]:
-    """What each order of each joint takes of the squares that the fit leaves, as a share, and the fit's freedom."""
+def _spectra(fit: Tested, waves: Sequence[Waves], beside: Array) -> list[tuple[Array, float]]:
+    """What each order of each joint takes of the measured rows' squares that are left, as a share, and their freedom."""
     rows, posture, noise = np.flatnonzero(fit.used), fit.linear.posture, fit.noise
     e, basis, freedom = _left(fit, rows)
     if beside.shape[1]:
-        basis = np.hstack([basis, _basis(_above(beside[rows] / noise[rows, None], len(e)), basis)])
-        e = e - basis @ (basis.T @ e)
+        more = _basis(_above(beside[rows] / noise[rows, None], len(e)), basis)
+        e = e - more @ (more.T @ e)
+        freedom -= float(np.sum(more[: len(rows)] ** 2))
     found, inside = [], rows[posture[rows] >= 0]
     left, member = e[: len(rows)][posture[rows] >= 0], posture[inside]
     for one in waves:
         motion = one.motion[inside] / noise[inside]
         pull, square = (np.bincount(member, x, minlength=len(one.sine)) for x in (motion * left, motion**2))
-        found.append((_by_posture(one.sine, one.cosine, pull, square) / (e @ e), freedom))
+        taken = _by_posture(one.sine, one.cosine, pull, square)
+        found.append((taken / _measured(e, len(rows)), freedom))
     return found
 
 
@@ -200,7 +203,7 @@ def score_jitter(fit: Tested, ways: Float[Array, "rows joints"]) -> tuple[float,
     def statistic(left: Array) -> Array:
         """(draws, joints), in the mean square of each draw."""
         sums = np.stack([np.sum(((left * g) @ member) ** 2, axis=1) / max(g @ g, 1e-300) for g in G.T], axis=1)
-        return sums / (np.sum(left**2, axis=1) / freedom)[:, None]
+        return sums / (_measured(left, len(rows)) / freedom)[:, None]
 
     draws = np.random.default_rng(0).normal(size=(_DRAWS, len(e)))
     null = statistic(draws - (draws @ basis) @ basis.T)
@@ -224,8 +227,9 @@ def _flipped(e: Array, posture: Array, draws: Array) -> Array:
     return found
 
 
-def _left(fit: Tested, rows: Array) -> tuple[Array, Array, int]:
-    """What the fit leaves of its rows and prior rows, whitened; an orthonormal basis of its columns; its freedom."""
+def _left(fit: Tested, rows: Array) -> tuple[Array, Array, float]:
+    """What the fit leaves of its rows and prior rows, whitened; an orthonormal basis of its columns; the measured rows'
+    freedom."""
     linear, noise, _, precision, free = fit
     G = linear.jacobian[rows][:, free] / noise[rows, None]
     root = np.sqrt(np.where(linear.prior[free] == FLAT, 0.0, precision[free]))
@@ -235,7 +239,17 @@ def _left(fit: Tested, rows: Array) -> tuple[Array, Array, int]:
     basis, kept = np.linalg.qr(A)
     solid = np.abs(np.diag(kept)) > 1e-12 * np.abs(np.diag(kept)).max(initial=0.0)  # nothing is free: no column
     basis = basis[:, solid]
-    return e - basis @ (basis.T @ e), basis, len(e) - basis.shape[1]
+    return e - basis @ (basis.T @ e), basis, max(len(rows) - float(np.sum(basis[: len(rows)] ** 2)), 1.0)
+
+
+def _off(draws: Array, basis: Array, measured: int) -> Array:
+    """The measured rows of each draw off the fit's columns."""
+    return draws[:, :measured] - (draws @ basis) @ basis[:measured].T
+
+
+def _measured(e: Array, measured: int) -> Array:
+    """Sum of squares of the measured rows, the first ones."""
+    return np.sum(e[..., :measured] ** 2, axis=-1)
 
 
 def _above(Z: Array, length: int) -> Array:

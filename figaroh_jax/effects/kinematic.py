@@ -42,7 +42,7 @@ __all__ = [
 ]
 
 Array = np.ndarray
-_MOVED = 0.01  # rad or m: less is no motion to another posture
+_MOVED = 0.01  # rad or m: where no joint moves more, the posture is the one before
 _ORDERS = tuple(np.arange(2.0, 12.5, 0.5))  # of gear errors, per turn of the joint
 
 
@@ -186,16 +186,19 @@ def _turned(axis: Array, q: Array, vector: Array) -> Float[np.ndarray, "3 sample
 def _history(model, at, sign):
     for j in range(len(model.joints)):
         move = _move(model)
-        law = (lambda p, j, move=move: _side(move(p, j))) if sign else move
+        law = (lambda p, j, move=move: _side(move(p, j), p.before - p.q)) if sign else move
         motion = axis_twist(model, j)
         yield model.joints[j].name, "1", [(j, lambda p, j=j, law=law, motion=motion: motion[:, None] * law(p, j))]
 
 
-def _side(way: Any) -> Any:
-    """Sign of a motion; of repeats of one posture it would be that of what was measured: the tool is brought to touch
-    again, and where it errs the joints go along."""
-    lib = _library(way)
-    return lib.where(abs(way) > _MOVED, lib.sign(way), 0.0)
+def _side(way: Any, whole: Any) -> Any:
+    """Sign of a motion; none where the `whole` posture is one again.
+
+    Of repeats it would be that of what was measured: where a tool that is brought to touch again errs, its joints go
+    along.
+    """
+    lib = _library(whole)
+    return lib.where(abs(whole).max(axis=1) > _MOVED, lib.sign(way), 0.0)
 
 
 def _library(array: Any) -> Any:
@@ -348,8 +351,8 @@ class ReversalHysteresis(JointEffect):
     width: Scalar = amplitude("rad")
 
     def position_error(self, motion: Any) -> Float[Leaf, " samples"]:
-        """-width times the side from which the joint came, rad: reading minus truth; zero where it hardly moved."""
-        return -self.width * _side(self.here(motion.way))
+        """-width times the side from which the joint came, rad: reading minus truth; zero where it did not move."""
+        return -self.width * _side(self.here(motion.way), motion.way)
 
 
 @register
