@@ -17,8 +17,10 @@ from generators import postures
 from schema import matches
 
 from figaroh_jax import cli
-from figaroh_jax.calibration.kinematic_diagnosis import _has_size
+from figaroh_jax.calibration.kinematic_diagnosis import _has_size, diagnose_poses
 from figaroh_jax.effects.kinematic import CATALOGUE
+from figaroh_jax.formats.urdf import load_urdf
+from figaroh_jax.recordings.arrays import postures as postures_of
 from figaroh_jax.reporting.calibration_report import write_calibration_report
 from figaroh_jax.results import Cause, Estimate, Gain, Name
 
@@ -144,6 +146,22 @@ def test_a_robot_that_is_right_and_stands_where_it_is_said_to_has_nothing_to_fit
     case = postures.Hidden("nothing", frozenset(), (), (postures.Recording(np.arange(40.0), q, seen, False),))
     found = study().diagnose(arm, case)
     assert found.causes == () and found.calibration.solution.free.names == ()
+
+
+def test_errors_of_a_camera_in_the_hand_are_no_joint_that_varies(folder: Path):
+    """A board 1.5 m away: what its orientation errs by moves the camera's own position by far more than its noise."""
+    arm, rng = study().arm("arm6", folder), np.random.default_rng(48)
+    q = poses.postures(rng, 60)
+    board = pin.SE3(pin.exp3(np.array([0.3, 2.5, 0.4])), np.array([1.2, 0.3, 0.9]))
+    mark = pin.SE3(pin.exp3(np.array([0.1, -0.2, 0.3])), np.array([0.02, 0.0, 0.05]))
+    seen = [(pose * mark).inverse() * board for pose in _exact(arm, q)]
+    noisy = [s * pin.SE3(pin.exp3(1e-3 * rng.normal(size=3)), 2e-4 * rng.normal(size=3)) for s in seen]
+    run = postures_of(
+        q=q, camera=np.array([s.homogeneous for s in noisy]), base_frame=arm.base, tool_frame=arm.tool, mount="hand"
+    )
+    found = diagnose_poses(load_urdf(arm.path, joints=list(arm.joints)), [run])
+    assert (found.verdict, found.causes, found.calibration.notes) == ("nothing", (), ())
+    assert found.noise[0] is not None and abs(found.noise[0] - 0.2) < 0.03
 
 
 def _exact(arm: Any, q: np.ndarray) -> list[pin.SE3]:

@@ -80,6 +80,7 @@ def devices(rng: np.random.Generator) -> dict[str, tuple[Device, np.ndarray]]:
         "points": (Points(base, centre, BOTH, rng.normal(size=(2, 3))), rng.normal(size=(N, 2, 3))),
         "poses": (Poses(base, centre, BOTH, turn(rng)), near),
         "poses on the body": (Poses(base, centre, BOTH, turn(rng), "body"), near),
+        "poses of a camera": (Poses(base, centre, BOTH, turn(rng), "sight"), near),
         "twists": (Poses(base, centre, BOTH, turn(rng), "twist"), near),
         "camera": (
             Camera(base, centre, BOTH, turn(rng), board=board, intrinsics=camera),

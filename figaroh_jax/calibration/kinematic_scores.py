@@ -2,8 +2,8 @@ r"""Score tests of blocks of columns against a fit with priors, with the maximum
 
 The fit's rows, whitened, and the rows of its prior stand above each other: $e = (r, \Lambda^{1/2} y)$ is what it
 leaves, M the projector off its columns, $\tilde Z = (Z, 0)$ a block. $Q = |B' e|^2$ with B an orthonormal basis of
-$M \tilde Z$, over the mean square of the measured rows of e: links that are better than the prior's width say nothing of
-the noise. Wilson and Hilferty's cube root puts blocks of different size on one scale.
+$M \tilde Z$, over the mean square of the measured rows of e: links that are better than the prior's width say nothing
+of the noise. Wilson and Hilferty's cube root puts blocks of different size on one scale.
 Two nulls, the larger p counts: e is white, drawn again with its own level; and e of whole postures with their signs
 flipped, which holds where the error of a posture moves all its rows together (play, a slack joint). The largest score
 of all blocks is kept in each draw.
@@ -138,7 +138,7 @@ def waves_shown(
 
 
 def _spectra(fit: Tested, waves: Sequence[Waves], beside: Array) -> list[tuple[Array, float]]:
-    """What each order of each joint takes of the measured rows' squares that are left, as a share, and their freedom."""
+    """What each order of each joint takes of the squares of the measured rows, as a share, and their freedom."""
     rows, posture, noise = np.flatnonzero(fit.used), fit.linear.posture, fit.noise
     e, basis, freedom = _left(fit, rows)
     if beside.shape[1]:

@@ -10,7 +10,7 @@
 #define INLINE static inline __attribute__((always_inline))
 
 typedef struct {
-  long samples, joints, moving, poses, body, free_base, free_tool, markers;
+  long samples, joints, moving, poses, body, sight, free_base, free_tool, markers;
   const double *start, *base, *origin, *centre, *tool, *arm; /* rotations (9) before the first joint, of base and tool; points */
   const double *first, *ahead, *beyond;       /* (3), (n, 3), (3) */
   const double *onward, *slide;               /* (n, samples, 9), (n, samples, 3) or none */
@@ -29,6 +29,14 @@ INLINE void turned(const double *a, const double *x, double *y) {
 INLINE void skew(const double *w, double *k) {
   k[0] = k[4] = k[8] = 0.0;
   k[1] = -w[2], k[2] = w[1], k[3] = w[2], k[5] = -w[0], k[6] = -w[1], k[7] = w[0];
+}
+
+/* Of columns of six rows, N apart, the last three by k added to the first */
+static void mixed(double *out, long columns, long next, long N, const double *k) {
+  for (long n = 0; n < columns; n++, out += next) {
+    const double angle[3] = {out[3 * N], out[4 * N], out[5 * N]};
+    for (int i = 0; i < 3; i++) out[i * N] += k[3 * i] * angle[0] + k[3 * i + 1] * angle[1] + k[3 * i + 2] * angle[2];
+  }
 }
 
 /* sin t / t, (1 - cos t) / t^2, (t - sin t) / t^3 and the two further ones of SE(3) */
@@ -264,6 +272,14 @@ void pose_rows(const Given *g) {
           out[i * N] = by_tool[0][3 * i + n], out[3 * next + i * N] = by_tool[1][3 * i + n];
           out[(3 + i) * N] = 0.0, out[3 * next + (3 + i) * N] = by_tool[3][3 * i + n];
         }
+    }
+    if (g->sight) { /* the device's origin as it is seen: rows and derivatives of the angles mixed into the positions */
+      double eye[3];
+      turned(back, g->seen + 3 * s, eye);
+      skew(eye, k);
+      mixed(g->residual + s, 1, next, N, k);
+      mixed(g->response + s, 6 * g->joints, next, N, k);
+      mixed(g->by_own + s, own, next, N, k);
     }
   }
 }

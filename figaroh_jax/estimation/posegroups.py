@@ -131,7 +131,8 @@ def shared(recordings: Sequence[PoseRecording]) -> list[list[int]]:
     groups: dict[Any, list[int]] = {}
     for k, r in enumerate(recordings):
         markers = r.values.shape[1] if r.kind == "position" else 0
-        groups.setdefault((r.kind, r.base_frame, r.tool_frame, r.unknown, markers, id(r.device)), []).append(k)
+        same = r.kind, r.base_frame, r.tool_frame, r.unknown, markers, id(r.device), r.carried
+        groups.setdefault(same, []).append(k)
     return list(groups.values())
 
 
@@ -202,7 +203,7 @@ def _poses(recordings, R, p, fit) -> tuple[Device, np.ndarray, np.ndarray]:
     centre = np.nanmean(poses[fit][:, :3, 3], axis=0)
     measured = np.repeat(np.stack([place, turned], axis=1), 3, axis=1)
     whole = np.where(np.isfinite(poses), poses, np.eye(4))
-    return Poses(base, centre, unknown, tool), whole, measured
+    return Poses(base, centre, unknown, tool, "sight" if recordings[0].carried else "device"), whole, measured
 
 
 def _sockets(recordings, R, p, fit) -> tuple[Device, np.ndarray, np.ndarray]:

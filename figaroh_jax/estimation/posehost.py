@@ -32,7 +32,7 @@ def written_out(device: Any) -> bool:
 
 
 _MOST_JOINTS = 64  # of the code in C
-_LONGS = ("samples", "joints", "moving", "poses", "body", "free_base", "free_tool", "markers")
+_LONGS = ("samples", "joints", "moving", "poses", "body", "sight", "free_base", "free_tool", "markers")
 _FIXED = ("start", "base", "origin", "centre", "tool", "arm", "first", "ahead", "beyond", "onward", "slide", "back",
           "seen", "marker")  # fmt: skip
 _GIVEN = ("twists", "own", "residual", "response", "by_own")
@@ -92,7 +92,11 @@ class HostRows:
         self.free_base, self.free_tool = (name in device.estimated for name in ("base_frame", "tool_frame"))
         datum = np.asarray(datum, float)
         if self.poses:
-            self.tool, self.body = np.asarray(device.tool, float), device.axes == "body"
+            self.tool, self.body, self.sight = (
+                np.asarray(device.tool, float),
+                device.axes != "device",
+                device.axes == "sight",
+            )
             self.back, self.seen = np.swapaxes(datum[:, :3, :3], 1, 2), datum[:, :3, 3]
         else:
             self.markers = np.asarray(device.markers, float)
@@ -120,8 +124,8 @@ class HostRows:
         }  # fmt: skip
         fixed |= {} if self.slide is None else {"slide": self.slide}
         self.fixed = {name: np.ascontiguousarray(x, float) for name, x in fixed.items()}
-        markers, body = (0, self.body) if poses else (len(self.markers), False)
-        longs = self.samples, len(self.turn), False, poses, body, self.free_base, self.free_tool, markers
+        markers, body, sight = (0, self.body, self.sight) if poses else (len(self.markers), False, False)
+        longs = self.samples, len(self.turn), False, poses, body, sight, self.free_base, self.free_tool, markers
         self.given = _Given(*(int(x) for x in longs))
         for name, x in self.fixed.items():
             setattr(self.given, name, x.ctypes.data)
@@ -218,6 +222,11 @@ class HostRows:
         if self.body:
             away = _times(self.back, away)
             by_motion[:, :3], by_own[:, :3] = self.back @ by_motion[:, :3], self.back @ by_own[:, :3]
+        if self.sight:
+            cross = _skew(_times(self.back, self.seen))  # turning x where the device's origin is
+            away = away + _times(cross, angle)
+            by_motion[:, :3] += cross @ by_motion[:, 3:]
+            by_own[:, :3] += cross @ by_own[:, 3:]
         return np.concatenate([away, angle], axis=1), by_motion, by_own
 
 

@@ -145,6 +145,7 @@ def postures(
         load=load,
         role=role,
         device=device,
+        carried="camera" in kinds and poses.carried("camera", mount),
     )
 
 
@@ -176,7 +177,7 @@ def _measurement(
         return kind, poses.points(values, table, kind) * scale
     found = poses.poses(values, table, kind)
     found[:, :3, 3] *= scale
-    if kind == "camera" and mount == "hand":
+    if poses.carried(kind, mount):
         found = np.linalg.inv(np.where(np.isfinite(found), found, np.nan))
     return "pose", found
 

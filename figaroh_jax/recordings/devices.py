@@ -148,11 +148,13 @@ class Poses(Placed):
 
     The rows are the difference of the positions, on the device's axes or (`axes` "body") on the measured ones, and the
     logarithm of the rotation from the measured to the predicted orientation; with `axes` "twist", the logarithm of the
-    whole motion from the one pose to the other.
+    whole motion from the one pose to the other. `axes` "sight" is for a camera that the robot carries, whose pose is
+    told by what it sees: how far the device's origin, the board, stands elsewhere in the camera, to first order. There
+    the errors of position and orientation are those of the camera; in the camera's own position they are mixed.
     """
 
     tool: Float[Leaf, "4 4"]  # pose of the marker in the tool frame, at the start
-    axes: Literal["device", "body", "twist"] = eqx.field(static=True, default="device")
+    axes: Literal["device", "body", "twist", "sight"] = eqx.field(static=True, default="device")
 
     def residual(self, pose: Array, unknown: Array, datum: Leaf) -> Float[Array, "6"]:
         """Predicted against measured pose (4, 4): three rows in m, three in rad; see the class for their axes."""
@@ -161,7 +163,11 @@ class Poses(Placed):
             return lie.log_se3(lie.inverse_pose(datum) @ predicted)
         turn = lie.log_so3(datum[:3, :3].T @ predicted[:3, :3])
         away = predicted[:3, 3] - datum[:3, 3]
-        return jnp.concatenate([datum[:3, :3].T @ away if self.axes == "body" else away, turn])
+        if self.axes != "device":
+            away = datum[:3, :3].T @ away
+        if self.axes == "sight":
+            away = away + jnp.cross(turn, -datum[:3, :3].T @ datum[:3, 3])
+        return jnp.concatenate([away, turn])
 
     def places(self, unknown: Array) -> dict[str, Array]:
         """Poses (4, 4): the base frame in the device's frame, the marker in the tool frame."""

@@ -54,6 +54,7 @@ class PoseRecording:
     role: Literal["fit", "holdout"] = "fit"
     notes: tuple[str, ...] = ()
     device: Device | None = None  # of kind "own"
+    carried: bool = False  # poses of a camera that the robot carries: told by how it sees what stands in the origin
 
 
 def read_pose_recordings(task: Task, model: RobotModel) -> tuple[PoseRecording, ...]:
@@ -95,7 +96,13 @@ def _read(task: Task, entry: RecordingEntry, key: str, model: RobotModel, drive:
         load=entry.load,
         role=entry.role,
         notes=notes,
+        carried=carried(measurement.kind, measurement.mount),
     )
+
+
+def carried(kind: str, mount: str | None) -> bool:
+    """Whether a measurement is that of a camera which the robot carries."""
+    return kind == "camera" and mount == "hand"
 
 
 def _frames(task: Task, measurement: Measurement, key: str, model: RobotModel):
@@ -154,7 +161,7 @@ def _values(table: Table, measurement: Measurement, key: str, samples: int, scal
         return kind, points(values, table, where) * scale
     found = poses(values, table, where)
     found[:, :3, 3] *= scale
-    if kind == "camera" and measurement.mount == "hand":  # the board stands still: the camera's pose seen from it
+    if carried(kind, measurement.mount):  # the board stands still: the camera's pose seen from it
         found = np.linalg.inv(np.where(np.isfinite(found), found, np.nan))
     return "pose", found
 
