@@ -22,12 +22,14 @@ from ..estimation.posegroups import Measured, assemble, postures_of
 from ..estimation.posesolver import Solution, solve
 from ..recordings.poses import PoseRecording, read_pose_recordings
 from ..recordings.posture_checks import check_pose_recordings, spread_of
+from ..results import Name, Nearest
 from ..rigid.chain import chain_between
 from ..rigid.model import RobotModel
 from . import corrections, levels, thresholds
 from .calibrated import Calibration, Error, Outlier
 from .candidates import Block, blocks_of, effects_on, empty_columns, geometry_columns, known_frames
 from .distances import socket_distances
+from .kinematic_scores import Tested, row_noise, score_blocks, score_waves
 from .outliers import find_outliers
 from .shapes import refine
 
@@ -124,6 +126,8 @@ class Run:
     named: list[int]
     extension: list[Block]  # the named effects as they are fitted
     history: bool  # whether an error that depends on the posture before was found and has no name
+    p_effects: float  # that noise alone brings the largest gain of an effect
+    unsure: list[Nearest]  # effects that predict better and are not named
     fit: tuple[Measured, marginal.Linear, marginal.Posterior, Solution]
 
     def __init__(
@@ -134,7 +138,9 @@ class Run:
         progress: Callable[[str, float], None],
         level: str | None = None,
         priors: bool = True,
+        alpha: float = 0.05,
     ) -> None:
+        self.alpha = alpha
         self.model, self.recordings, self.forbid, self.progress = model, tuple(recordings), tuple(forbid), progress
         self.level, self.priors = level, priors
         progress("reading the postures", 0.02)
@@ -184,9 +190,63 @@ class Run:
         if self.history:
             self.notes.append("the error of a posture depends on the one before it in a way that no effect explains")
         self.progress("fitting", 0.85)
-        self.extension = self._refined()
-        self.fit = self._fit(self.choice.level, self.extension)
+        self._name_the_sure()
         return self._result()
+
+    def _name_the_sure(self) -> None:
+        """Leave out effects whose gain noise alone may bring, or whose size may be zero, and fit the others."""
+        plain, chosen = (levels.pooled([getattr(f, which) for f in self.folds]) for which in ("plain", "chosen"))
+        shares = [1.0 - b / a for a, b in zip(plain, chosen, strict=True) if np.isfinite(a) and a > 0.0]
+        share = max(shares[0], 0.0) if shares else 0.0
+        self.p_effects, self.unsure = self._p_effects(), []
+        if self.p_effects > thresholds.OF_ALPHA * self.alpha:
+            names = dict.fromkeys(self.blocks[k].name for k in self.named)
+            self.unsure = [Nearest(name, share, "noise alone brings such a gain") for name in names]
+            self.named = []
+        while True:
+            self.extension = self._refined()
+            self.fit = self._fit(self.choice.level, self.extension)
+            small = self._smallest()
+            if small is None:
+                return
+            self.unsure.append(Nearest(small, share, "its size may be zero"))
+            self.named = [k for k in self.named if self.blocks[k].name != small]
+
+    def _smallest(self) -> Name | None:
+        """The fitted effect that is nearest to none, where that may be."""
+        final, linear, posterior, _ = self.fit
+        place = {column.label: k for k, column in enumerate(final.columns)}
+        sigma = np.sqrt(np.diag(marginal.honest_covariance(posterior, linear.prior)))
+        sizes = {}
+        for block in self.extension:
+            own = [place[column.label] for column in block.columns]
+            sizes[block.name] = float(np.max(np.abs(linear.at[own]) / sigma[own]))
+        least = min(sizes, key=lambda name: sizes[name], default=None)
+        return least if least is not None and sizes[least] <= thresholds.SIZE_SIGMAS else None
+
+    def _p_effects(self) -> float:
+        """p-value of the largest score of an effect beside the level; of what may be named also beside all links."""
+        level = self.choice.level
+        found = self.p_value(self.choice.fits[level], level)
+        if self.named and level != "full":  # few postures may not tell links that are all a little off
+            found = max(found, self.p_value(self.choice.fits["full"], "full"))
+        return found
+
+    def p_value(self, fit: tuple[marginal.Linear, marginal.Posterior], level: str, named: Sequence[int] = ()) -> float:
+        """p-value of the largest score of an effect that is not `named` beside a fit."""
+        if self.effects is None:
+            return 1.0
+        linear, posterior = fit
+        columns = len(self.measured.columns)  # behind them those of effects, then the devices'
+        extra = len(linear.at) - columns - len(self.measured.own)
+        at = np.concatenate([linear.at[:columns], linear.at[columns + extra :]])
+        grid = range(self.effects.grid)
+        Z = self.effects.jacobian(at, grid)
+        blocks = [Z[:, s] for k, s in self.effects.slices(grid).items() if k not in named]
+        free = levels.free_at(level, linear.prior)
+        tested = Tested(linear, row_noise(linear, posterior), self.used, posterior.precision, free)
+        p_grid, p_high = score_blocks(tested, blocks).p_value, score_waves(tested, self.effects.waves(at))
+        return min(p_grid, p_high) if p_high == 1.0 else min(1.0, 2.0 * min(p_grid, p_high))
 
     def _or_frames_alone(self) -> None:
         """Frames and their own effects, but for effects that predict better beside the level that was chosen."""

@@ -27,7 +27,7 @@ from .calibrated import Calibration
 from .calibration import Run
 from .candidates import GEOMETRY, moved_rows, moves, twist_rows
 from .kinematic_evidence import Evidence, weigh
-from .kinematic_scores import Scores, Tested, row_noise, score_blocks, score_jitter, score_waves
+from .kinematic_scores import Scores, Tested, row_noise, score_blocks, score_jitter
 from .outliers import playing_joints, still_outliers
 
 if TYPE_CHECKING:
@@ -80,23 +80,18 @@ def diagnose_poses(
     turned by as many mrad as it may be shifted by half millimetres.
     """
     with jax.enable_x64(True):
-        run = Run(model, recordings, forbid, progress)
+        run = Run(model, recordings, forbid, progress, alpha=alpha)
         calibration = run.finish()
         progress("testing", 0.92)
         own = _geometry(run, calibration, alpha, tolerance)
-        p_effects, p_rest = _effect_scores(run)
+        p_rest = run.p_value((run.fit[1], run.fit[2]), run.choice.level, run.named)
         effects = [c for c in calibration.causes if c.name.effect not in (*GEOMETRY, "outlier")]
         play = _play(run, alpha)
         aside: list[tuple[Cause, str]] = []
-        if p_effects > thresholds.OF_ALPHA * alpha:
-            aside += [(c, "noise alone brings such a gain") for c in effects]
-            effects = []
-        elif play.found:  # a law that leaves its own joint erring at random is not the right one
+        if play.found:  # a law that leaves its own joint erring at random is not the right one
             why = "its joint varies between postures beside it"
             aside += [(c, why) for c in effects if c.name.at in play.places]
             effects = [c for c in effects if c.name.at not in play.places]
-        aside += [(c, "its size may be zero") for c in effects if not _has_size(c)]
-        effects = [cause for cause in effects if _has_size(cause)]
         geometry = [replace(c, ambiguous_with=_allowed(c, forbid)) for c in own.causes if c.name.effect not in forbid]
         found = bool(geometry or effects)
         notes = [*calibration.notes, *own.notes]
@@ -113,11 +108,12 @@ def diagnose_poses(
             notes += [f"{c.note}, no farther than a joint that varies so may move it" for c in within]
             outliers = [c for c, s in zip(outliers, still, strict=True) if s]
         causes = tuple([*outliers, *geometry, *_with_rivals(effects, run)])
-        p_value = min(1.0, 2.0 * min(own.p_value, p_effects))
+        p_value = min(1.0, 2.0 * min(own.p_value, run.p_effects))
         rest = own.rest or run.history or play.found or p_rest < thresholds.OF_ALPHA * alpha
         rest = rest or _beyond_accuracy(recordings, calibration)
         rest = rest or (found and not (geometry or effects)) or len(own.causes) > len(geometry)
         nearest = [*own.nearest, *(Nearest(c.name, _share(c.gain), why) for c, why in aside)]
+        nearest += run.unsure
         left = _left(calibration, run)
         return _answer(replace(calibration, notes=tuple(notes)), causes, p_value, rest, nearest, left)
 
@@ -348,32 +344,6 @@ def _simplest(scores: Scores) -> int:
     return int(np.argmax(merit))
 
 
-def _effect_scores(run: Run) -> tuple[float, float]:
-    """p-value of the largest score of an effect beside the level alone, and beside the level with its effects.
-
-    Of effects that are named beside less than all links also beside all of these: the larger one.
-    """
-    if run.effects is None:
-        return 1.0, 1.0
-    grid = range(run.effects.grid)
-    slices = run.effects.slices(grid)
-
-    def p_value(fit: tuple[marginal.Linear, marginal.Posterior], level: str, named: Sequence[int]) -> float:
-        assert run.effects is not None
-        at = _without_effects(fit[0], run)
-        Z = run.effects.jacobian(at, grid)
-        blocks = [Z[:, s] for k, s in slices.items() if k not in named]
-        free = levels.free_at(level, fit[0].prior)
-        tested = Tested(fit[0], row_noise(*fit), run.used, fit[1].precision, free)
-        p_grid, p_high = score_blocks(tested, blocks).p_value, score_waves(tested, run.effects.waves(at))
-        return min(p_grid, p_high) if p_high == 1.0 else min(1.0, 2.0 * min(p_grid, p_high))
-
-    found = p_value(run.choice.fits[run.choice.level], run.choice.level, ())
-    if run.named and run.choice.level != "full":  # few postures may not tell links that are all a little off
-        found = max(found, p_value(run.choice.fits["full"], "full", ()))
-    return found, p_value((run.fit[1], run.fit[2]), run.choice.level, run.named)
-
-
 class _Play(NamedTuple):
     """Whether postures err beyond noise in all their rows together, which joints may do it, and the outliers beside."""
 
@@ -410,21 +380,6 @@ def _play(run: Run, alpha: float) -> _Play:
             f" or poor repeatability ({joints[worst][0]} would explain most)"
         )
     return _Play(True, tuple((name,) for name in names), tuple(outliers), note)
-
-
-def _has_size(cause: Cause) -> bool:
-    """Whether some amplitude of an effect is surely not zero: a cause may have come in for what another explains."""
-    entry = CATALOGUE.get(cause.name.effect)
-    linear = entry.amplitudes() if entry else []
-    sizes = [value for name, value in cause.parameters.items() if name in linear]
-    return not sizes or any(abs(one.value) > thresholds.SIZE_SIGMAS * one.std for one in sizes)
-
-
-def _without_effects(linear: marginal.Linear, run: Run) -> np.ndarray:
-    """Unknowns of the columns of geometry and of the devices alone."""
-    columns = len(run.measured.columns)
-    extra = len(linear.at) - columns - len(run.measured.own)
-    return np.concatenate([linear.at[:columns], linear.at[columns + extra :]])
 
 
 def _with_rivals(effects: Sequence[Cause], run: Run) -> list[Cause]:
