@@ -7,8 +7,8 @@ never move, number and range of the postures, repeats, how far the links are off
 exactly none), noise (also with a heavy tail), and what is measured: poses, one point, three markers, a camera in the
 hand, planes, sockets, with frames that are known or not. Half of the sets hide nothing, the others an encoder's zero, a
 gear's error or a joint that gives way under gravity. Everything is made by Pinocchio.
-One line a case; at the end a table of the verdicts, and every case with a name that is not the truth, an error or a
-warning. Outliers are no wrong names where the noise has a heavy tail.
+One line a case; at the end tables of the verdicts of both commands, and every case with a name that is neither the
+truth nor said to be alike, an error or a warning. Outliers are no wrong names where the noise has a heavy tail.
 """
 
 from __future__ import annotations
@@ -113,11 +113,12 @@ def main() -> None:
         line = f"{seed}: {case.told}\n    " + "\n    ".join(lines)
         print(line, flush=True)
         effect = case.told.split(",", 1)[0].split()[0]
-        count[effect, marks[0]] += 1
+        for job, mark in zip(("diagnose", "calibrate"), marks, strict=True):
+            count[f"{job} {effect}", mark] += 1
         if any(mark in ("wrong", "error", "warning") for mark in marks):
             odd.append(line)
     for (effect, mark), number in sorted(count.items()):
-        print(f"{effect:12} {mark:10} {number}")
+        print(f"{effect:22} {mark:10} {number}")
     print(*odd, sep="\n")
 
 
@@ -259,8 +260,11 @@ def answered(case: Case) -> tuple[list[str], list[str]]:
             file = "answer.json" if job == "diagnose" else "result.json"
             answer = json.loads((folder / job / file).read_text())
             names = [(c["effect"], " ".join(c["at"])) for c in answer["causes"]]
-            others = [one for one in names if one != case.truth and not (one[0] == "outlier" and case.heavy)]
-            mark = "warning" if noted else "wrong" if others else "right" if names and case.truth else answer["verdict"]
+            sets = [[(o["effect"], " ".join(o["at"])) for o in c["ambiguous_with"]] for c in answer["causes"]]
+            fair = [one == case.truth or case.truth in also for one, also in zip(names, sets, strict=True)]
+            others = [n for n, f in zip(names, fair, strict=True) if not f and not (n[0] == "outlier" and case.heavy)]
+            mark = "right" if case.truth in names else "set" if any(fair) else answer["verdict"]
+            mark = "warning" if noted else "wrong" if others else mark
             marks.append(mark)
             lines.append(f"{job}: {answer['verdict']}, {', '.join(' '.join(one) for one in names) or 'no cause'}")
             lines[-1] += "".join(f"; {one.message}" for one in noted[:1])

@@ -303,6 +303,7 @@ class Run:
         table = _table(self.folds, bool(self.named))
         position, orientation, scheme = self._errors(final, frames, linear.residual, table)
         causes = corrections.causes_of(parameters, level, self.extension, self.blocks, table, self.folds)
+        causes = tuple(replace(c, ambiguous_with=self._rivals().get(c.name, ())) for c in causes)
         twists = corrections.twists_of(self.model, final, linear.at)
         names = [c.label for c in final.columns] + [name for name, _ in final.own]
         found = corrections.solution_of(
@@ -335,6 +336,15 @@ class Run:
             ),
             points=corrections.shown_of(final, self.recordings, frames, linear.residual),
         )
+
+    def _rivals(self) -> dict[Name, tuple[Name, ...]]:
+        """Of each effect that joined what gained nearly as much in its place."""
+        found = {}
+        for k, others in zip(self.choice.effects, self.choice.rivals, strict=True):
+            own = self.blocks[k].name
+            names = (self.blocks[j].name for j in others if self.blocks[j].effect is not HISTORY)
+            found[own] = tuple(dict.fromkeys(name for name in names if name != own))
+        return found
 
     def _errors(
         self, final: Measured, frames: np.ndarray, after: np.ndarray, table: dict[str, tuple[float, float]]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import jax
 import numpy as np
 
-from ..effects.kinematic import CATALOGUE, HISTORY
+from ..effects.kinematic import CATALOGUE
 from ..estimation import marginal
 from ..recordings.poses import PoseRecording, read_pose_recordings
 from ..recordings.posture_checks import check_pose_recordings
@@ -107,7 +107,7 @@ def diagnose_poses(
             within = [c for c, s in zip(outliers, still, strict=True) if not s]
             notes += [f"{c.note}, no farther than a joint that varies so may move it" for c in within]
             outliers = [c for c, s in zip(outliers, still, strict=True) if s]
-        causes = tuple([*outliers, *geometry, *_with_rivals(effects, run)])
+        causes = tuple([*outliers, *geometry, *effects])
         p_value = min(1.0, 2.0 * min(own.p_value, run.p_effects))
         rest = own.rest or run.history or play.found or p_rest < thresholds.OF_ALPHA * alpha
         rest = rest or _beyond_accuracy(recordings, calibration)
@@ -380,17 +380,6 @@ def _play(run: Run, alpha: float) -> _Play:
             f" or poor repeatability ({joints[worst][0]} would explain most)"
         )
     return _Play(True, tuple((name,) for name in names), tuple(outliers), note)
-
-
-def _with_rivals(effects: Sequence[Cause], run: Run) -> list[Cause]:
-    """The causes with what gained nearly as much in their place."""
-    rivals: dict[Name, tuple[Name, ...]] = {}
-    for k, others in zip(run.choice.effects, run.choice.rivals, strict=True):
-        own = Name(run.blocks[k].effect.name, run.blocks[k].columns[0].at)
-        named = (run.blocks[j] for j in others if run.blocks[j].effect is not HISTORY)
-        names = (Name(block.effect.name, block.columns[0].at) for block in named)
-        rivals[own] = tuple(dict.fromkeys(name for name in names if name != own))
-    return [replace(cause, ambiguous_with=rivals.get(cause.name, ())) for cause in effects]
 
 
 def _beyond_accuracy(recordings: Sequence[PoseRecording], calibration: Calibration) -> bool:
