@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import jax
@@ -126,7 +127,6 @@ class Run:
     named: list[int]
     extension: list[Block]  # the named effects as they are fitted
     history: bool  # whether an error that depends on the posture before was found and has no name
-    p_effects: float  # that noise alone brings the largest gain of an effect
     unsure: list[Nearest]  # effects that predict better and are not named
     fit: tuple[Measured, marginal.Linear, marginal.Posterior, Solution]
 
@@ -198,8 +198,8 @@ class Run:
         plain, chosen = (levels.pooled([getattr(f, which) for f in self.folds]) for which in ("plain", "chosen"))
         shares = [1.0 - b / a for a, b in zip(plain, chosen, strict=True) if np.isfinite(a) and a > 0.0]
         share = max(shares[0], 0.0) if shares else 0.0
-        self.p_effects, self.unsure = self._p_effects(), []
-        if self.p_effects > thresholds.OF_ALPHA * self.alpha:
+        self.unsure = []
+        if self.named and self.p_effects > thresholds.OF_ALPHA * self.alpha:
             names = dict.fromkeys(self.blocks[k].name for k in self.named)
             self.unsure = [Nearest(name, share, "noise alone brings such a gain") for name in names]
             self.named = []
@@ -224,7 +224,8 @@ class Run:
         least = min(sizes, key=lambda name: sizes[name], default=None)
         return least if least is not None and sizes[least] <= thresholds.SIZE_SIGMAS else None
 
-    def _p_effects(self) -> float:
+    @cached_property
+    def p_effects(self) -> float:
         """p-value of the largest score of an effect beside the level; of what may be named also beside all links."""
         level = self.choice.level
         found = self.p_value(self.choice.fits[level], level)
@@ -303,7 +304,8 @@ class Run:
         table = _table(self.folds, bool(self.named))
         position, orientation, scheme = self._errors(final, frames, linear.residual, table)
         causes = corrections.causes_of(parameters, level, self.extension, self.blocks, table, self.folds)
-        causes = tuple(replace(c, ambiguous_with=self._rivals().get(c.name, ())) for c in causes)
+        rivals = self._rivals()
+        causes = tuple(replace(c, ambiguous_with=rivals.get(c.name, ())) for c in causes)
         twists = corrections.twists_of(self.model, final, linear.at)
         names = [c.label for c in final.columns] + [name for name, _ in final.own]
         found = corrections.solution_of(

@@ -92,11 +92,8 @@ class HostRows:
         self.free_base, self.free_tool = (name in device.estimated for name in ("base_frame", "tool_frame"))
         datum = np.asarray(datum, float)
         if self.poses:
-            self.tool, self.body, self.sight = (
-                np.asarray(device.tool, float),
-                device.axes != "device",
-                device.axes == "sight",
-            )
+            self.tool = np.asarray(device.tool, float)
+            self.body, self.sight = device.axes != "device", device.axes == "sight"
             self.back, self.seen = np.swapaxes(datum[:, :3, :3], 1, 2), datum[:, :3, 3]
         else:
             self.markers = np.asarray(device.markers, float)
@@ -223,7 +220,7 @@ class HostRows:
             away = _times(self.back, away)
             by_motion[:, :3], by_own[:, :3] = self.back @ by_motion[:, :3], self.back @ by_own[:, :3]
         if self.sight:
-            cross = _skew(_times(self.back, self.seen))  # turning x where the device's origin is
+            cross = _skew(_times(self.back, self.seen))  # the angle x where the device's origin is seen
             away = away + _times(cross, angle)
             by_motion[:, :3] += cross @ by_motion[:, 3:]
             by_own[:, :3] += cross @ by_own[:, 3:]
