@@ -410,7 +410,7 @@ def _join(words: Sequence[str], last: str) -> str:
 
 
 def _with_unit(text: str, of: str) -> str:
-    return f"{text} {unit(of)}" if of else text
+    return text if of in ("", "1") else f"{text} {unit(of)}"  # a pure number has none
 
 
 def _minus(text: str) -> str:
