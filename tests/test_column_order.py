@@ -14,6 +14,7 @@ import robots
 import yaml
 
 import figaroh_jax as fj
+from figaroh_jax.calibration.kinematic_diagnosis import diagnose_poses
 from figaroh_jax.cli import main
 from figaroh_jax.diagnosis.problem import Part
 from figaroh_jax.effects.kinematic import CATALOGUE as POSES
@@ -186,3 +187,39 @@ def test_a_calibration_names_the_joint_of_the_recording(data_dir: Path, tmp_path
     assert np.hypot(*(cause["parameters"][k]["value"] for k in ("sine", "cosine"))) == pytest.approx(
         4e-3, rel=0.1, abs=0
     )
+
+
+# a linkage that keeps the forearm's direction, as palletisers have it: the last joint of the first three follows
+LINKAGE = robots.robot(
+    *robots.LINKS,
+    robots.joint("shoulder", "base", "a", axis="0 0 1", more=robots.LIMIT),
+    robots.joint("lift", "a", "b", axis="0 1 0", more=robots.LIMIT),
+    robots.joint("rod", "b", "c", axis="0 1 0", more=robots.LIMIT + '<mimic joint="lift" multiplier="-1"/>'),
+    robots.joint("wrist", "c", "d", axis="1 1 0", more=robots.LIMIT),
+)
+
+
+def test_an_error_of_a_joint_that_others_follow_moves_them_too(tmp_path: Path) -> None:
+    """A gear's error of the leader, columns from the last; Pinocchio takes the follower as a joint of its own."""
+    (tmp_path / "robot.urdf").write_text(LINKAGE)
+    their = pin.buildModelFromUrdf(str(tmp_path / "robot.urdf"))
+    state, rng, names = their.createData(), np.random.default_rng(), ["wrist", "lift", "shoulder"]
+    q = rng.uniform(-1.4, 1.4, (100, 3))
+    true = dict(zip(names, q.T, strict=True))
+    true["lift"] = true["lift"] + 8e-3 * np.sin(3.0 * true["lift"])
+    seen = []
+    for k in range(len(q)):
+        position = np.zeros(their.nq)
+        for name, value in (*((n, true[n][k]) for n in names), ("rod", -true["lift"][k])):
+            position[their.joints[their.getJointId(name)].idx_q] = value
+        pin.framesForwardKinematics(their, state, position)
+        pose = state.oMf[their.getFrameId("d")]
+        seen.append((pose * pin.SE3(pin.exp3(1e-4 * rng.normal(size=3)), 1e-4 * rng.normal(size=3))).homogeneous)
+    robot = fj.load_urdf(tmp_path / "robot.urdf", joints=names)
+    found = diagnose_poses(robot, [fj.postures(q=q, pose=np.array(seen), base_frame="base", tool_frame="d")])
+    assert [(c.name.effect, c.name.at) for c in found.causes] == [("gear_transmission_error", ("lift",))]
+    size = found.causes[0].parameters
+    assert size["order"].value == pytest.approx(3.0, rel=0, abs=0.1)
+    assert np.hypot(size["sine"].value, size["cosine"].value) == pytest.approx(8e-3, rel=0.05, abs=0)
+    (effect,) = found.solution.model.effects
+    assert effect.places.tolist() == [names.index("lift")]  # the exported model has it at the leader

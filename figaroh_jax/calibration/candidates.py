@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect
-from ..effects.kinematic import CATALOGUE, HISTORY, Column, Postures, axis_twist, columns_of, shape_of
+from ..effects.kinematic import CATALOGUE, HISTORY, Column, Postures, axis_twist, columns_of, moving_with, shape_of
 from ..estimation import posefit
 from ..estimation.posegroups import Measured
 from ..recordings.poses import PoseRecording
@@ -194,7 +194,8 @@ def effects_on(model: RobotModel, postures: Sequence[Postures], measured: Measur
     def waves(unknowns: Float[np.ndarray, " unknowns"]) -> Iterator[Waves]:
         by_twist = twist_rows(measured, unknowns) if high else {}
         for joint, which in high.items():
-            rows = by_twist[joint] @ axis_twist(model, joint) if joint in by_twist else np.zeros(len(measured.posture))
+            moved = [(k, factor) for k, factor in moving_with(model, joint) if k in by_twist]
+            rows = sum((f * by_twist[k] @ axis_twist(model, k) for k, f in moved), np.zeros(len(measured.posture)))
             sine, cosine = turned.get(joint) or of_angle(joint, which)
             if sine.size <= _WAVES_KEPT:
                 turned[joint] = sine, cosine

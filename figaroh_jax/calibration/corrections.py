@@ -121,11 +121,12 @@ def _by_posture(final: Measured, rows: np.ndarray) -> np.ndarray:
 
 
 def _effects_of(model: RobotModel, final: Measured, at: np.ndarray, named: Sequence[Block]) -> Iterator[Effect]:
-    """The named effects that have a form at the joints' sensors, with their sizes."""
+    """The named effects that have a form at the joints' sensors, with their sizes; a joint that follows has none."""
     size = dict(zip((c.label for c in final.columns), at * np.asarray(final.problem.scale), strict=False))
     for block in named:
-        if block.effect.has("position_error"):
-            joints = np.array([model.joints[model.tree_index(name)].coordinate for name in block.columns[0].at], int)
+        own = [model.joints[model.tree_index(name)] for name in block.columns[0].at]
+        if block.effect.has("position_error") and not any(joint.follows for joint in own):
+            joints = np.array([joint.coordinate for joint in own], int)
             values = {c.parameter: np.float64(block.effect.correction * size[c.label]) for c in block.columns}
             curved = shape_of(block.effect)[0]
             yield block.effect(joints, **values, **({curved: np.float64(block.shape)} if curved else {}))

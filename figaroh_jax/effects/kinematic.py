@@ -37,6 +37,7 @@ __all__ = [
     "across",
     "axis_twist",
     "columns_of",
+    "moving_with",
     "shape_of",
     "twists_of",
 ]
@@ -441,6 +442,15 @@ def twists_of(effects: Sequence[Effect], model: RobotModel, postures: Postures) 
     return total
 
 
+def moving_with(model: RobotModel, joint: int) -> list[tuple[int, float]]:
+    """The tree joint and those that follow it, each with how far it moves for 1 rad or m of the joint."""
+    if model.joints[joint].follows:
+        return [(joint, 1.0)]
+    column = model.joints[joint].coordinate
+    followers = [k for k, other in enumerate(model.joints) if other.follows and other.coordinate == column]
+    return [(joint, 1.0), *((k, float(model.ratio[k])) for k in followers)]
+
+
 def _tree_joints(model: RobotModel) -> dict[int, int]:
     """Tree joint of each coordinate, by its first column of v."""
     return {joint.coordinate: k for k, joint in enumerate(model.joints) if not joint.follows}
@@ -450,14 +460,15 @@ def _shifts(
     effect: type[Effect], model: RobotModel, at: tuple[int, ...], shape: float
 ) -> Iterator[tuple[str, str, Sequence[tuple[int, Callable]]]]:
     """Twists along the joints' own motions: what a reading with the effect has to be moved by to be true."""
-    joints = at[-1:] if at else tuple(range(len(model.joints)))
+    joints = moving_with(model, at[-1]) if at else [(j, float(model.ratio[j])) for j in range(len(model.joints))]
+    joints = joints[:1] if effect is JointOffset else joints  # of geometry: each joint has one
     columns = tuple(model.joints[j].coordinate for j in at)  # of v, as every effect has its place
     unit_shape = {shape_of(effect)[0]: shape} if shape_of(effect)[0] else {}
     for name, parameter in effect.parameters().items():
         if parameter.linear:
             one = partial(_sized, effect, columns, **{name: effect.correction}, **unit_shape)
             unit = joint_unit(parameter.unit or "1", bool(at) and model.joints[at[-1]].kind != "revolute")
-            yield name, unit, [(j, _shift(model, j, one)) for j in joints]
+            yield name, unit, [(j, _shift(model, j, factor, at[-1] if at else j, one)) for j, factor in joints]
 
 
 @cache
@@ -474,14 +485,17 @@ def _sized(effect: type[Effect], at: tuple[int, ...], **values: float) -> Effect
 
 
 def _shift(
-    model: RobotModel, joint: int, one: Callable[[], Effect]
+    model: RobotModel, joint: int, factor: float, own: int, one: Callable[[], Effect]
 ) -> Callable[[Postures], Float[np.ndarray, "6 samples"]]:
-    """The field of an effect that is made when it is asked for: of many candidates few ever are."""
-    motion = axis_twist(model, joint)
+    """The field of an effect that is made when it is asked for: of many candidates few ever are.
+
+    The `joint` moves by a `factor` of the error at the joint `own`.
+    """
+    motion = factor * axis_twist(model, joint)
 
     def field(postures: Postures) -> Float[np.ndarray, "6 samples"]:
         made = one()
-        seen = postures.motion(model, joint)
+        seen = postures.motion(model, own)
         error = np.asarray(type(made).position_error(made, seen))  # a bound method is a module too
         return -motion[:, None] * (error if error.ndim == 1 else error[:, model.joints[joint].coordinate])
 
