@@ -5,8 +5,9 @@
 Each set of `hide_in_real` is diagnosed by the command line as it is and in each way: columns by name (as ROS sorts
 them), from the last to the first, recordings in another order, positions in degrees, stamps of the Unix epoch, single
 precision, CSV, the robot file with its joints and links in another order, with other names of links, turned on its base
-together with gravity; a way that leaves a set as it is, is left out. Printed are verdict, held-out error, and of the
-causes how many are the same and the largest difference of a number, in its standard deviations.
+together with gravity, a joint's axis the other way round, the motor side of gears; a way that leaves a set as it is, or
+that does not fit it, is left out. Printed are verdict, held-out error, and of the causes how many are the same and the
+largest difference of a number, in its standard deviations.
 """
 
 from __future__ import annotations
@@ -199,6 +200,37 @@ def _turned(task: dict[str, Any], arrays: Arrays, urdf: str) -> Case:
     return task, arrays, ElementTree.tostring(root, encoding="unicode")
 
 
+def _flipped(task: dict[str, Any], arrays: Arrays, urdf: str) -> Case | None:
+    """The joint in the middle turns the other way round, in the robot file and in the recordings."""
+    if "transmission" in task:
+        return None
+    names = task["robot"]["joints"]
+    k, root = len(names) // 2, ElementTree.fromstring(urdf)  # noqa: S314  the set's own file
+    joint = next(one for one in root.iter("joint") if one.get("name") == names[k])
+    axis = joint.find("axis")
+    if axis is None:
+        axis = ElementTree.SubElement(joint, "axis", {"xyz": "1 0 0"})
+    axis.set("xyz", " ".join(str(-float(x)) for x in axis.attrib["xyz"].split()))
+    limit = joint.find("limit")
+    if limit is not None and "lower" in limit.attrib:
+        ends = [str(-float(limit.attrib[end])) for end in ("upper", "lower")]
+        limit.attrib |= dict(zip(("lower", "upper"), ends, strict=True))
+    sign = np.where(np.arange(len(names)) == k, -1.0, 1.0)
+    turned = [{key: v * sign if v.ndim == 2 else v for key, v in own.items()} for own in arrays]
+    return task, turned, ElementTree.tostring(root, encoding="unicode")
+
+
+def _motor_side(task: dict[str, Any], arrays: Arrays, urdf: str) -> Case | None:
+    """Positions and torques before gears of 30 to 120, every second one turning the other way."""
+    if "transmission" in task:
+        return None
+    names = task["robot"]["joints"]
+    gear = np.linspace(30.0, 120.0, len(names)) * np.where(np.arange(len(names)) % 2, -1.0, 1.0)
+    told = [{k: (v / gear if k == "tau" else v * gear) if v.ndim == 2 else v for k, v in one.items()} for one in arrays]
+    both = dict.fromkeys(("position", "torque"), np.diag(gear).tolist())
+    return task | {"transmission": both}, told, urdf
+
+
 WAYS: dict[str, Callable[..., Case | None]] = {
     "columns by name": _ordered(_by_name),
     "columns from the last": _ordered(lambda names: list(range(len(names)))[::-1]),
@@ -210,6 +242,8 @@ WAYS: dict[str, Callable[..., Case | None]] = {
     "robot file in another order": _shuffled,
     "other names of links": _renamed,
     TURNED: _turned,
+    "axis the other way round": _flipped,
+    "motor side": _motor_side,
 }
 
 

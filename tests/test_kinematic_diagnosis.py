@@ -19,6 +19,7 @@ from schema import matches
 from figaroh_jax import cli
 from figaroh_jax.calibration import thresholds
 from figaroh_jax.calibration.kinematic_diagnosis import diagnose_poses
+from figaroh_jax.calibration.kinematic_evidence import _root
 from figaroh_jax.effects.kinematic import CATALOGUE
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.recordings.arrays import postures as postures_of
@@ -329,3 +330,13 @@ def test_intervals_hold_the_truth_as_often_as_they_say(folder: Path):
     shares = {name: np.mean(hits) for name, hits in inside.items()}
     assert 0.92 <= np.mean(list(shares.values())) <= 0.98
     assert min(shares.values()) >= 0.86, shares
+
+
+@pytest.mark.parametrize("lowest", [0.5, 0.0, -1e-14])
+def test_a_root_of_an_information_that_rounding_makes_negative(lowest: float):
+    """Against the matrix itself: contacts of a plane that leave a direction untold ended in an error."""
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(4, 4)))[0]
+    matrix = turn @ np.diag([lowest, 1.0, 2.0, 3.0]) @ turn.T
+    root, size = _root(matrix)
+    np.testing.assert_allclose(root @ root.T, matrix, rtol=0, atol=1e-13)
+    assert np.isfinite(size) and (lowest < 0.5 or abs(size - 0.5 * np.log(3.0)) < 1e-12)

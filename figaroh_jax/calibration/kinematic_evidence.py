@@ -84,10 +84,10 @@ class Evidence:
     def _log(self, width: Array) -> float:
         """Logarithm of the evidence at given widths, up to what is the same for all."""
         precision = self._precision(width)
-        root = np.linalg.cholesky(self.power * self.normal + np.diag(precision))
+        root, size = _root(self.power * self.normal + np.diag(precision))
         half = np.linalg.solve(root, self.power * self.pull)
         fit = half @ half - self.power * self.square
-        return float(0.5 * fit - np.log(np.diag(root)).sum() + 0.5 * np.log(precision).sum())
+        return float(0.5 * fit - size + 0.5 * np.log(precision).sum())
 
     def of(self, chosen: Sequence[int], start: tuple[float, float] = (1.0, 1.0)) -> Weighed:
         """The set `chosen` at its best widths, climbed from links that are `start` tolerances wide."""
@@ -168,3 +168,15 @@ def _instead(evidence: Evidence, now: Weighed, k: int, columns: Sequence[int]) -
     close = sorted((j for j in trials if trials[j].value >= least), key=lambda j: -trials[j].value)
     name = min(close, key=lambda j: columns[j])  # of equals the likeliest
     return trials[name], name, tuple(j for j in close if j != name)
+
+
+def _root(matrix: Array) -> tuple[Array, float]:
+    """R with R R' the matrix, and log |det R|; what rounding makes negative, where rows tell little, is none."""
+    try:
+        root = np.linalg.cholesky(matrix)
+        return root, float(np.log(np.diag(root)).sum())
+    except np.linalg.LinAlgError:
+        scale = np.sqrt(np.diag(matrix))
+        values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+        values = np.maximum(values, len(values) * np.finfo(float).eps)
+        return scale[:, None] * vectors * np.sqrt(values), float(np.log(scale).sum() + 0.5 * np.log(values).sum())
