@@ -23,7 +23,7 @@ from .fit import Fit, fit, spread_of_recordings
 from .gates import Slight, checked, gained, in_order, needless, replaced, rms_of, standing, still_needed, worthy
 from .parameters import put, values
 from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_of_entry, outputs, sprung_now, tried_now
-from .search import Model, Named, Search, Tried, all_but, judged_by_colour, sized, t_of
+from .search import TOO_LITTLE, Model, Named, Search, Tried, all_but, judged_by_colour, sized, t_of, why_not_sized
 from .sensitivity import predicted
 from .setting import Setting, Structure, begins_of, begun, by_recording, evened, free_entries, level_of, thinned
 from .shared import at_all_joints, t_together
@@ -409,7 +409,7 @@ def _round(
     if not kept:
         nearest = [
             (Name(one.candidate.effect, one.candidate.at), max(float((total - one.sse.sum()) / total), 0.0),
-             "improves held-out data too little")
+             (why_not_sized(here, one) if worthy(here, now, one) else "") or TOO_LITTLE)
             for one in close
         ]  # fmt: skip
     return kept, now, nearest
@@ -589,4 +589,4 @@ def _name(
 
 
 def _level(here: Setting, one: Fit) -> float:
-    return level_of(one, np.asarray(here.data.weight))
+    return level_of(one, np.asarray(here.data.share))

@@ -26,7 +26,7 @@ from .gates import rms_of, standing
 from .loop import Loop, brought_back
 from .parameters import TEN, Entry, put, values
 from .screening import Standing, excess_of
-from .search import Model, Named, Search, t_of, t_of_recordings
+from .search import TOO_LITTLE, Model, Named, Search, t_of, t_of_recordings
 from .sensitivity import Windows
 from .setting import Setting, Structure, by_recording, free_entries, thinned
 from .steady import most_unsteady
@@ -192,7 +192,7 @@ def _links(here: Setting, found: _Rigid) -> tuple[list[Link], Standing, list[tup
             return *_needed(here, now, links, new), []
         if gain > GAIN_BESIDE_REST and not missed:
             alone = gain > MOST_OF_A_REST and by_recording(here)
-            why = "not as good in all recordings" if alone else "improves held-out data too little"
+            why = "not as good in all recordings" if alone else TOO_LITTLE
             missed = [(Name(EFFECT, (loop.robot.link_names[link.at],)), gain, why) for link in links]
     return [], now, missed
 
@@ -292,9 +292,10 @@ def _fitted(
 
 def _early(data: Windows) -> Windows:
     """The windows with the first of their rows alone."""
-    weight = np.array(data.weight)
-    weight[round(_EARLY * (weight > 0).any((1, 2)).sum()) :] = 0.0
-    return eqx.tree_at(lambda d: d.weight, data, weight)
+    weight, share = np.array(data.weight), np.array(data.share)
+    late = round(_EARLY * (weight > 0).any((1, 2)).sum())
+    weight[late:], share[late:] = 0.0, 0.0
+    return eqx.tree_at(lambda d: (d.weight, d.share), data, (weight, share))
 
 
 def as_bodies(here: Setting, model: Model, links: Sequence[Link], gained_from: float) -> Model | None:
@@ -355,7 +356,7 @@ def _moved_to_bodies(
 
 def _level(model: Model) -> float:
     """Squares of a row that counts, at least those of noise."""
-    return max(model.fit.squares / max((np.asarray(model.structure.data.weight) > 0).sum(), 1), 1.0)
+    return max(model.fit.squares / max(np.asarray(model.structure.data.share).sum(), 1), 1.0)
 
 
 def _freed(sound: Setting, whole: Setting, found: _Rigid, links: Sequence[Link], now: Standing) -> Setting:

@@ -22,6 +22,7 @@ __all__ = [
     "as_recorded",
     "noise_of",
     "regular",
+    "told_by",
     "windows",
     "without_gaps",
 ]
@@ -30,6 +31,7 @@ _GAP, _GAPS = 3.0, 0.01  # periods from a row to the next, and share of rows, up
 _LEAD = 0.2  # s of command kept before a window: no delay is longer
 _KEPT = 0.97334  # variance of a normal variable that never leaves three sigma
 _SMOOTH = 0.99  # level of the squares left by a cubic, up to which it follows the rows
+_WHOLE_STEPS = 0.01  # steps by which every value of a counter may be off a whole number of them
 
 
 class Run(NamedTuple):
@@ -144,12 +146,29 @@ def noise_of(values: np.ndarray) -> np.ndarray:
 
 
 def _step(values: np.ndarray) -> np.ndarray:
-    """Least step of each column where it repeats values (a counter's resolution), else 0."""
+    """Least step of each column where it repeats values, or has whole steps alone (a counter's resolution), else 0."""
     found = np.zeros(values.shape[1])
     for k, column in enumerate(values.T):
         levels = np.unique(np.round(column, 9))
-        if 1 < len(levels) < 0.5 * len(column):
-            found[k] = np.min(np.diff(levels))
+        if len(levels) < 2:
+            continue
+        least = np.min(np.diff(levels))
+        whole = (levels - levels[0]) / least
+        if len(levels) < 0.5 * len(column) or (least > 1e-7 and np.abs(whole - np.round(whole)).max() < _WHOLE_STEPS):
+            found[k] = least
+    return found
+
+
+def told_by(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
+    """How much of a reading each row tells: a counter that stands tells one, however often it is read.
+
+    Rows one after the other with the same value share it; else each tells one.
+    """
+    found = np.ones(values.shape)
+    for k, column in enumerate(values.T):
+        first = np.flatnonzero(np.concatenate([[True], column[1:] != column[:-1]]))
+        length = np.diff(np.append(first, len(column)))
+        found[:, k] = 1 / np.repeat(length, length)
     return found
 
 
@@ -175,7 +194,7 @@ def windows(
     most = max(s.rows for s in stretches)
     rows = -(-most // rows_of_block) * rows_of_block
     lead = int(np.ceil(_LEAD / period))
-    command, reading, weight, start, precision, carried = [], [], [], [], [], []
+    command, reading, weight, share, start, precision, carried = [], [], [], [], [], [], []
     for stretch in stretches:
         run = runs[stretch.run]
         at = np.clip(np.arange(stretch.first - lead, stretch.first + rows), 0, len(run.time) - 1)
@@ -187,7 +206,9 @@ def windows(
         counted = inside if run.trusted is None else (inside & run.trusted[here].T).T
         parts = [run.position] + ([run.velocity] if len(noise) > 1 and run.velocity is not None else [])
         reading.append(np.concatenate([p[here] for p in parts], 1))
-        weight.append(np.concatenate([counted.reshape(rows, -1) / s for s in noise], 1))
+        told = [counted.reshape(rows, -1) * told_by(p)[here] for p in parts]
+        share.append(np.concatenate(told, 1))
+        weight.append(np.concatenate([np.sqrt(x) / s for x, s in zip(told, noise, strict=False)], 1))
         rows_of_state = _smooth_rows(run, stretch.first, noise[0]) if smooth else 5
         state, certainty = _state(loop, run, stretch.first, noise, period, rows_of_state)
         start.append(state)
@@ -203,6 +224,7 @@ def windows(
         lead=lead,
         block=rows_of_block,
         pole=None if pole is None else np.repeat(np.asarray(pole, float)[:, None], len(stretches), 1),
+        share=np.stack(share, -1),
     )
 
 

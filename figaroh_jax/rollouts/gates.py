@@ -218,5 +218,5 @@ def rms_of(here: Setting, squares: np.ndarray, joint: int = -1) -> float:
     """
     each = np.maximum(squares.reshape(-1, squares.shape[-1]).sum(axis=0), 0.0) * here.spread**2
     mine = alike(here.loop) if joint < 0 else np.arange(len(each)) == joint
-    count = (np.asarray(here.data.weight) > 0).sum() / here.loop.robot.nv * mine.sum()
+    count = np.asarray(here.data.share).sum() / here.loop.robot.nv * mine.sum()
     return float(np.sqrt(each[mine].sum() / max(count, 1)))

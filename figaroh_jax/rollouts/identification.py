@@ -21,7 +21,7 @@ from .fit import Fit, System, fit, standard_errors
 from .loop import Loop
 from .own import is_own
 from .parameters import BOUNDS, OF_DRIVES, TEN, put, unit_of
-from .setting import Setting, Structure, begun, coloured, residuals
+from .setting import Setting, Structure, begun, coloured, level_of, rms_of_rows
 from .task import (
     all_slide,
     colour_notes,
@@ -133,10 +133,8 @@ def _result(
     here: Setting, first: Fit, held: dict[str, tuple[Run, np.ndarray]], notes: tuple[str, ...]
 ) -> dict[str, Any]:
     structure = Structure(here.loop, here.known.table, here.data)
-    error = residuals(structure, first)[:, : len(here.noise[0])]
-    count = np.maximum((np.asarray(here.data.weight)[:, : len(here.noise[0])] > 0).sum((0, 2)), 1)
-    rms = np.sqrt((error**2).sum((0, 2)) / count) * here.noise[0]
-    level = max(1.0, first.squares / (np.asarray(here.data.weight) > 0).sum())
+    rms = rms_of_rows(structure, first)[: len(here.noise[0])] * here.noise[0]
+    level = max(1.0, level_of(first, np.asarray(here.data.share)))
     covariance = System(first.sums, here.data, first.start).covariance(first.free < 0)
     size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     free = [k for k in range(len(first.free)) if first.free[k] >= 0]

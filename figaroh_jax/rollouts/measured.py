@@ -136,9 +136,9 @@ def rollout_data(
         cut = windows(loop, runs, stretches, [spread], _WHOLE)
     rows = max(len(run.time) for run in runs)
     kept = eqx.tree_at(
-        lambda w: (w.command, w.reading, w.weight),
+        lambda w: (w.command, w.reading, w.weight, w.share),
         cut,
-        (cut.command[: cut.lead + rows], cut.reading[:rows], cut.weight[:rows]),
+        (cut.command[: cut.lead + rows], cut.reading[:rows], cut.weight[:rows], cut.share[:rows]),
     )
     if cut.carried is not None:
         kept = eqx.tree_at(lambda w: w.carried, kept, cut.carried[:rows])

@@ -255,10 +255,10 @@ def _only(data: Windows, which: np.ndarray) -> Windows:
     return jax.tree.map(lambda x: np.asarray(x)[..., which], data)
 
 
-def _rows(here: Setting, joint: int) -> int:
-    """Samples of a joint that count."""
+def _rows(here: Setting, joint: int) -> float:
+    """Readings of a joint."""
     column = here.loop.measured.index(joint)
-    return int((np.asarray(here.data.weight)[:, column :: len(here.loop.measured)] > 0).sum())
+    return float(np.asarray(here.data.share)[:, column :: len(here.loop.measured)].sum())
 
 
 def _asked_by(one: Candidate, others: Sequence[_Ranked]) -> bool:
@@ -513,11 +513,11 @@ def outputs(here: Setting, squares: Any) -> np.ndarray:
 
 def excess_of(here: Setting, structure: Structure, one: Fit) -> np.ndarray:
     """How far each joint's residual is above noise."""
-    error, weight = whitened(structure, one), np.asarray(structure.data.weight)
+    error, share = whitened(structure, one), np.asarray(structure.data.share)
     count, found = len(here.loop.measured), np.zeros(here.loop.robot.nv)
     for k, place in enumerate(here.loop.measured):
         mine = slice(k, None, count)
-        found[place] = excess(error[:, mine], weight[:, mine]) if (weight[:, mine] > 0).any() else 0.0
+        found[place] = excess(error[:, mine], share[:, mine]) if share[:, mine].any() else 0.0
     return found
 
 

@@ -60,12 +60,15 @@ __all__ = [
     "scored",
     "search",
     "settled",
+    "TOO_LITTLE",
     "sized",
     "t_of",
     "t_of_places",
     "t_of_recordings",
+    "why_not_sized",
 ]
 
+TOO_LITTLE = "improves held-out data too little"
 _SHORT = 6  # candidates that are fitted where a linear screening can order them
 _CHECKED = 3  # candidates whose held-out squares are those of fits without some recordings
 _ROOM = 120  # columns beside what is free that one linearisation takes: each is a fiftieth of the first
@@ -169,9 +172,9 @@ def _searched(
     structure = Structure(here.loop, here.known.table, here.data)
     progress("fitting the baseline", 0.1)
     first = begun(here) if begin is None else begin
-    weight = np.asarray(here.data.weight)
-    now = Model(structure, first, here.baseline, excess(whitened(structure, first), weight))
-    stood, found, p_value, steps, nearest = [now], [], 1.0, [("baseline", level_of(first, weight))], []
+    share = np.asarray(here.data.share)
+    now = Model(structure, first, here.baseline, excess(whitened(structure, first), share))
+    stood, found, p_value, steps, nearest = [now], [], 1.0, [("baseline", level_of(first, share))], []
     most = _MOST if by_recording(here) else _MOST_ONE
     while len(found) < most:
         progress(f"searching for cause {len(found) + 1}", min(0.2 + 0.15 * len(found), 0.9))
@@ -185,14 +188,14 @@ def _searched(
         found.append(best[0])
         now = best[1]
         stood.append(now)
-        steps.append((str(Name(best[0].candidate.effect, best[0].candidate.at)), level_of(now.fit, weight)))
+        steps.append((str(Name(best[0].candidate.effect, best[0].candidate.at)), level_of(now.fit, share)))
         if now.excess < 1.0:
             break
     held = [_rms(here, held_out(first, here.folds)), *(n.after for n in found)]
     found, now, doubtful = _of_sure_size(here, now, found, forbid)
     for one, model in doubtful:
         stood.append(model)
-        steps.append((f"without {one[0]}", level_of(model.fit, weight)))
+        steps.append((f"without {one[0]}", level_of(model.fit, share)))
         held.append(_rms(here, _held_out(here, model, [])[1]))
     result = _judged(here, stood[0], now, found, p_value, steps, nearest)
     result.held, result.doubtful, result.spread = held, [one for one, _ in doubtful], _spread(here, now)
@@ -217,7 +220,7 @@ def _of_sure_size(
         less = simpler(here, now.structure, now.fit, now.free, gone, forbid)
         found, old = [n for n in found if n is not one], now.structure
         structure, last, free = fitted_without(here, old, now.fit, now.free, gone)
-        now = Model(structure, last, free, excess(whitened(structure, last), np.asarray(structure.data.weight)))
+        now = Model(structure, last, free, excess(whitened(structure, last), np.asarray(structure.data.share)))
         if less is not None:
             best, _ = _best(here, now, [_tried_one(here, old, less[0], *less[1:])], [])
             found, now = (found, now) if best is None else ([*found, best[0]], best[1])
@@ -321,8 +324,8 @@ def _raced(
 
 
 def _tried_one(here: Setting, structure: Structure, c: Candidate, best: Fit, free: Sequence[int]) -> Tried:
-    weight = np.asarray(structure.data.weight)
-    state = Model(structure, best, tuple(free), excess(whitened(structure, best), weight))
+    share = np.asarray(structure.data.share)
+    state = Model(structure, best, tuple(free), excess(whitened(structure, best), share))
     return Tried(c, state, held_out(best, here.folds))
 
 
@@ -488,7 +491,8 @@ def _best(
     worth = [GAIN_BESIDE_REST if r and not t.candidate.kind.usual else GAIN for r, t in zip(beside, tried, strict=True)]
     passing = [k for k in range(len(tried)) if gains[k] > worth[k] and ts[k] > needs[k] and sized(here, tried[k])]
     for k in np.argsort(gains)[::-1][:3]:
-        why = "no better than another" if k in passing else "improves held-out data too little"
+        enough = gains[k] > worth[k] and ts[k] > needs[k]
+        why = TOO_LITTLE if not enough else why_not_sized(here, tried[k]) or "no better than another"
         nearest.append((Name(tried[k].candidate.effect, tried[k].candidate.at), float(max(gains[k], 0.0)), why))
     if not passing:
         return None, p
@@ -538,12 +542,17 @@ def _held_out(here: Setting, now: Model, tried: Sequence[Tried]) -> tuple[list[T
 
 def _rms(here: Setting, squares: np.ndarray) -> float:
     """Whitened squares as an RMS of position: rad, or m."""
-    count = (np.asarray(here.data.weight) > 0).sum()
+    count = np.asarray(here.data.share).sum()
     return float(np.sqrt(max(squares.sum(), 0.0) / count * np.mean(here.spread**2)))
 
 
 def sized(here: Setting, one: Tried) -> bool:
     """Whether its first number is clear of no effect, and on no bound of the search."""
+    return not why_not_sized(here, one)
+
+
+def why_not_sized(here: Setting, one: Tried) -> str:
+    """Why a candidate's numbers make no cause of it, or nothing."""
     found = one.state.fit
     column = int(np.flatnonzero(found.free == one.candidate.entries[0])[0])
     error = standard_errors(found, one.state.structure.data)[column]
@@ -553,21 +562,23 @@ def sized(here: Setting, one: Tried) -> bool:
         width = one.candidate.entries[kind.telling]
         spread = standard_errors(found, one.state.structure.data)[int(np.flatnonzero(found.free == width)[0])]
         if not found.theta[width] > CLEAR_OF_NOTHING * spread:
-            return False
+            return "it is no more than what it contains"
     bounds = here.bounds[list(one.candidate.entries)] if not kind.elastic else np.zeros((0, 2))
     if any(found.theta[e] >= high for e, (_, high) in zip(one.candidate.entries, bounds, strict=False)):
-        return False
+        return "a number of it ends at the bound of the search"
     if kind.falls_off is not None:  # beyond every speed it is plain friction
         speed = one.candidate.entries[kind.falls_off]
         if found.theta[speed] > max(_top_speed(here, j) for j in one.state.structure.table[speed].at):
-            return False
+            return "no motion is as fast as the speed that it tells"
     if not shown(here, one.candidate, found.theta):
-        return False
+        return "the motion covers too little of it: so short a piece could be any smooth torque"
     if not kind.signed:
-        return bool(np.isfinite(error) and error < OF_ITS_SIZE * abs(value) + 1e-12)
-    if kind.together > 1:
-        return _clear_together(one)
-    return bool(np.isfinite(error) and abs(value - kind.neutral) > CLEAR_OF_NOTHING * error)
+        clear = np.isfinite(error) and error < OF_ITS_SIZE * abs(value) + 1e-12
+    elif kind.together > 1:
+        clear = _clear_together(one)
+    else:
+        clear = np.isfinite(error) and abs(value - kind.neutral) > CLEAR_OF_NOTHING * error
+    return "" if clear else "its size may be nothing"
 
 
 def _clear_together(one: Tried) -> bool:

@@ -36,6 +36,7 @@ __all__ = [
     "largest_forces",
     "level_of",
     "residuals",
+    "rms_of_rows",
     "setting",
     "start_values",
     "thinned",
@@ -190,7 +191,7 @@ def evened(here: Setting, structure: Structure, found: Fit) -> Setting:
     """
     plain = here.plain()
     data = structure._replace(data=plain.cut(structure.loop))
-    left, counted = residuals(data, found), np.asarray(data.data.weight) > 0
+    left, counted = residuals(data, found), np.asarray(data.data.share)
     run = np.array([one.run for one in here.stretches])
     size = np.ones((run.max() + 1, left.shape[1]))
     for k in np.unique(run):
@@ -231,6 +232,13 @@ def residuals(structure: Structure, found: Fit) -> np.ndarray:
     return (np.asarray(structure.data.reading) - np.asarray(read)) * np.asarray(structure.data.weight)
 
 
+def rms_of_rows(structure: Structure, found: Fit) -> np.ndarray:
+    """RMS over all rows of what a fit leaves of each position, over its noise, (ny,)."""
+    share = np.asarray(structure.data.share)
+    left = residuals(structure, found) / np.sqrt(np.where(share > 0, share, 1.0))
+    return np.sqrt((left**2).sum((0, 2)) / np.maximum((share > 0).sum((0, 2)), 1))
+
+
 def whitened(structure: Structure, found: Fit) -> np.ndarray:
     """What each row's residual tells beyond the row before it, (rows, ny, windows): white where it is noise."""
     pole = None if structure.data.pole is None else np.asarray(structure.data.pole)
@@ -250,20 +258,25 @@ def coloured(here: Setting, structure: Structure, found: Fit) -> Setting | None:
     return replace(again, data=again.cut(here.loop))
 
 
-def excess(error: np.ndarray, weight: np.ndarray) -> float:
-    """How many times what noise may reach the whitened residual is: its power, and that of its means over 25 rows."""
-    count = (weight > 0).sum()
+def excess(error: np.ndarray, share: np.ndarray) -> float:
+    """How many times what noise may reach the whitened residual is: its power, and that of its means over 25 rows.
+
+    Rows in which a counter stands, which have one `share`, have one error: their mean is as large as each of them.
+    """
+    count = share.sum()
     power = ((error**2).sum() / count - 1) / np.sqrt(6 / count)
     rows = len(error) // SLOW_ROWS * SLOW_ROWS
     means = error[:rows].reshape(-1, SLOW_ROWS, *error.shape[1:]).sum(1) / np.sqrt(SLOW_ROWS)
-    full = (weight[:rows] > 0).reshape(-1, SLOW_ROWS, *error.shape[1:]).all(1)
-    slow = ((means[full] ** 2).mean() - 1.0) / np.sqrt(4 / max(full.sum(), 1)) if full.any() else 0.0
+    parts = share[:rows].reshape(-1, SLOW_ROWS, *error.shape[1:])
+    full = (parts > 0).all(1)
+    due = np.minimum(parts.sum(1)[full], 1.0)  # of a counter that stands for k rows: 25 / k, where k is more than 25
+    slow = ((means[full] ** 2).sum() - due.sum()) / np.sqrt(4 * (due**2).sum()) if full.any() else 0.0
     return float(max(power / POWER, slow / SLOW))
 
 
-def level_of(found: Fit, weight: np.ndarray) -> float:
-    """Mean square of the misfit over the samples that count, in units of the noise's variance."""
-    return found.squares / max((weight > 0).sum(), 1)
+def level_of(found: Fit, share: np.ndarray) -> float:
+    """Mean square of the misfit over the readings, in units of the noise's variance."""
+    return found.squares / max(share.sum(), 1)
 
 
 def by_recording(here: Setting) -> bool:

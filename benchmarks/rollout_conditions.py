@@ -1,0 +1,416 @@
+"""Command and position as strangers record them: `diagnose` and `identify` of robots, drives and clocks that are drawn.
+
+    python benchmarks/rollout_conditions.py --seeds 0 60 [--effects nothing payload] [--most 3] [--jobs diagnose]
+
+Drawn are: number of joints (`--most`), their axes and which of them slide, a branch, how the base is mounted (turned in
+the file, or gravity turned), inertias or geoms, joints' zero positions, order of the columns, drives (position servos
+with and without limits, gears, filters; general ones of the same law; a URDF's way of a task's `actuator`), gains, time
+step and integrator, sampling, first time stamp, number and length of recordings, motions (waves, steps, one joint after
+another), noise (white or counts), and how far the file's friction, damping and armature are off, also not at all. Half
+of them hide nothing, the others one effect. Everything is made by MuJoCo C and goes through the command line.
+One line a case; at the end tables of verdicts, and every case with a name that is neither the truth nor said to be
+alike, an error or a warning.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import contextlib
+import io
+import json
+import tempfile
+import time
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+import yaml
+
+from figaroh_jax.cli import main as command_line
+
+MADE: Any = mujoco
+EFFECTS = (
+    "stribeck_friction",
+    "load_dependent_friction",
+    "command_delay",
+    "encoder_offset",
+    "payload",
+    "joint_spring",
+    "gravity_tilt",
+    "dead_band",
+    "torque_ripple",
+)
+DRIVES = ("position", "position", "limited", "geared", "general", "filtered", "stated")
+AXES = ("1 0 0", "0 1 0", "0 0 1", "0 -1 0", "0.6 0 0.8", "0 0.8 0.6")
+
+
+class Robot(NamedTuple):
+    """A robot as it is (`text`) and as its file has it, with what was drawn in words."""
+
+    text: str
+    file: str
+    names: list[str]  # of the joints, in the order of the file
+    ranges: np.ndarray  # rad or m that the joints travel about their start
+    friction: np.ndarray  # N m or N
+    weights: np.ndarray  # the same, of gravity and inertia at the joints
+    stated: dict[str, Any]  # drives that the task states, for a file that has none
+    told: str
+
+
+class Case(NamedTuple):
+    told: str
+    task: dict[str, Any]
+    file: str
+    recordings: list[dict[str, np.ndarray]]
+    truth: tuple[str, str] | None
+    spread: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", nargs=2, type=int, default=[0, 60], metavar=("FIRST", "END"))
+    parser.add_argument("--effects", nargs="+", choices=["nothing", *EFFECTS], default=[])
+    parser.add_argument("--most", type=int, default=4, help="joints of a robot")
+    parser.add_argument("--integrators", nargs="+", default=["implicitfast", "implicitfast", "Euler", "Euler", "RK4"])
+    parser.add_argument("--drives", nargs="+", choices=DRIVES, default=DRIVES)
+    parser.add_argument("--commands", nargs="+", choices=["diagnose", "identify"], default=["diagnose", "identify"])
+    args = parser.parse_args()
+    count: collections.Counter[tuple[str, str]] = collections.Counter()
+    odd = []
+    for seed in range(*args.seeds):
+        case = drawn(np.random.default_rng([seed, 77]), args)
+        if case is None:
+            print(f"{seed}: its own simulation is not stable", flush=True)
+            continue
+        marks, lines = answered(case, args.commands)
+        line = f"{seed}: {case.told}\n    " + "\n    ".join(lines)
+        print(line, flush=True)
+        effect = case.told.split(",", 1)[0].split()[0]
+        for job, mark in zip(args.commands, marks, strict=True):
+            count[f"{job} {effect}", mark] += 1
+        if any(mark in ("wrong", "error", "warning") for mark in marks):
+            odd.append(line)
+    for (effect, mark), number in sorted(count.items()):
+        print(f"{effect:36} {mark:10} {number}")
+    print(*odd, sep="\n")
+
+
+def drawn(rng: np.random.Generator, args: argparse.Namespace) -> Case | None:
+    """A case, or None where the robot's own simulation does not stay where it is commanded."""
+    every = args.effects or (["nothing"] if rng.random() < 0.5 else list(EFFECTS))
+    effect = str(rng.choice(every))
+    robot = _robot(rng, args.most, args.drives)
+    n, j = len(robot.names), int(rng.integers(len(robot.names)))
+    size = float(rng.choice([0.5, 1.0, 2.0]))
+    step, scheme = float(rng.choice([0.001, 0.002, 0.004])), str(rng.choice(args.integrators))
+    every_rows = int(rng.choice([k for k in (1, 2, 4, 5, 8, 10) if 0.003 < k * step <= 0.02]))
+    known = bool(rng.random() < 0.8)
+    noise, counts = float(rng.choice([5e-5, 2e-4, 1e-3])), int(rng.choice([0, 0, 4096, 16384]))
+    number, seconds = int(rng.integers(1, 4)), float(rng.choice([6.0, 12.0, 20.0]))
+    motion = str(rng.choice(["waves", "waves", "steps", "one after another"]))
+    option = f'timestep="{step}" integrator="{scheme}"'
+    recordings = []
+    for _ in range(number):
+        u = _command(rng, robot, motion, seconds, every_rows * step)
+        q, v = _moved(robot, option, u, every_rows, (effect, j, size))
+        if q is None:
+            return None
+        read = q + (noise * rng.standard_normal(q.shape) if not counts else 0.0)
+        if effect == "encoder_offset":
+            read[:, j] += 0.02 * size
+        if counts:
+            read = np.round(read * counts / (2 * np.pi)) * 2 * np.pi / counts
+        recordings.append({"q": read, "u": u, "dq": v})
+    start = float(rng.choice([0.0, 0.0, 17.3, 1.7e9]))
+    order = rng.permutation(n) if rng.random() < 0.5 else np.arange(n)
+    with_speed = bool(rng.random() < 0.3)
+    for one in recordings:
+        one["t"] = start + np.arange(len(one["q"])) * every_rows * step
+        one["u"], one["q"] = one["u"][:, order], one["q"][:, order]
+        one["dq"] = one["dq"][:, order] + 20 * noise * rng.standard_normal(one["dq"].shape)
+    entries = [
+        {"file": f"run{k}.npz", "time": "t", "command": "u", "position": "q"}
+        | ({"velocity": "dq"} if with_speed else {})
+        for k in range(number)
+    ]
+    if number > 1 and rng.random() < 0.5:
+        entries[-1]["role"] = "holdout"
+    joints = [robot.names[k] for k in order]
+    task: dict[str, Any] = {"robot": {"model": "robot.xml", "joints": joints}, "data": entries}
+    task["actuator"] = {"gains": "known" if known else "free"} | robot.stated
+    at = {"payload": f"body{n - 1}", "gravity_tilt": ""}.get(effect, robot.names[j])
+    place = f" at {at}" if at and effect != "nothing" else ""
+    reading = f"{counts} counts" if counts else f"noise {1e3 * noise:g} mrad"
+    told = (
+        f"{effect}{place} x{size:g}, {robot.told}, {option}, every {every_rows} steps, {number} of {seconds:g} s,"
+        f" {motion}, {reading}, gains {'known' if known else 'free'}"
+        f"{', columns ' + ' '.join(joints) if (order != np.arange(n)).any() else ''}"
+        f"{', holdout' if 'role' in entries[-1] else ''}{f', from {start:g} s' if start else ''}"
+        f"{', velocity' if with_speed else ''}"
+    )
+    file = robot.file.replace("<option", f"<option {option}")
+    return Case(told, task, file, recordings, (effect, at) if effect != "nothing" else None, noise)
+
+
+def _robot(rng: np.random.Generator, most: int, kinds: list[str]) -> Robot:
+    """A chain, or a chain with a branch, of servos that follow their commands with 1.5 to 5 Hz."""
+    n = int(rng.integers(1, most + 1))
+    slides = rng.random(n) < 0.12
+    axes = [str(rng.choice(AXES)) for _ in range(n)]
+    parent = [k - 1 for k in range(n)]
+    if n > 2 and rng.random() < 0.25:
+        parent[n - 1] = 0
+    mounted = str(rng.choice(["upright", "turned in the file", "gravity turned"], p=[0.6, 0.2, 0.2]))
+    turn = rng.uniform(-3, 3, 3) if mounted == "turned in the file" else np.zeros(3)
+    pull = np.array([0.0, 0.0, -9.81])
+    if mounted == "gravity turned":
+        pull = 9.81 * np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0], [0.6, 0, -0.8]][int(rng.integers(4))])
+    geoms, zeros = bool(rng.random() < 0.3), bool(rng.random() < 0.2)
+    mass, length = rng.uniform(0.2, 2.0, n) * 0.8 ** np.arange(n), rng.uniform(0.06, 0.3, n)
+    zero = np.round(rng.uniform(-1, 1, n), 2) if zeros else np.zeros(n)
+    spin = rng.uniform(0.5, 1.0, (n, 3))
+
+    def text(armature: np.ndarray, damping: np.ndarray, friction: np.ndarray, drives: str) -> str:
+        inside: list[str] = [""] * n
+        for k in reversed(range(n)):
+            size, half = mass[k] * length[k] ** 2 / 12 + 1e-5, length[k] / 2
+            loss = f'armature="{armature[k]:.6g}" damping="{damping[k]:.6g}" frictionloss="{friction[k]:.6g}"'
+            kind = "slide" if slides[k] else "hinge"
+            own = f'<joint name="j{k}" type="{kind}" axis="{axes[k]}" ref="{zero[k]:.3g}" {loss}/>'
+            middle = _words(0.1 * half, -0.2 * half, half)
+            spins = _words(size * (1 + spin[k, 0]), 2 * size, size * spin[k, 1])
+            link = f'<inertial pos="{middle}" mass="{mass[k]:.6g}" diaginertia="{spins}"/>'
+            if geoms:
+                shape = f'fromto="0 0 0 {_words(0.2 * half, 0.0, length[k])}" size="{0.15 * length[k]:.5g}"'
+                link = f'<geom type="capsule" {shape} mass="{mass[k]:.6g}" contype="0" conaffinity="0"/>'
+            place = _words(0.0, 0.0, 0.1 if parent[k] < 0 else length[parent[k]])
+            whole = f'<body name="body{k}" pos="{place}">{own}{link}{inside[k]}</body>'
+            if parent[k] < 0:
+                inside[k] = whole
+            else:
+                inside[parent[k]] += whole
+        return (
+            f'<mujoco><compiler angle="radian" eulerseq="XYZ"/><option gravity="{_words(*pull)}">'
+            f'<flag contact="disable"/></option><worldbody><body name="stand" euler="{_words(*turn)}">{inside[0]}'
+            f"</body></worldbody><actuator>{drives}</actuator></mujoco>"
+        )
+
+    bare = MADE.MjModel.from_xml_string(text(np.zeros(n), np.zeros(n), np.zeros(n), ""))
+    inertia, weight = _sizes(bare, zero, rng)
+    armature = inertia * rng.uniform(0.2, 1.5, n)
+    whole = inertia + armature
+    speed = 2 * np.pi * rng.uniform(1.5, 5.0, n)
+    kp, kv = whole * speed**2, 2 * rng.uniform(0.5, 1.1, n) * whole * speed * 0.7
+    damping, travel = 0.3 * kv, np.where(slides, 0.08, 0.5)
+    load = weight + whole * travel * 4.0
+    friction = load * rng.uniform(0.03, 0.25, n)
+    drive = str(rng.choice(kinds))
+    gear = float(rng.choice([0.5, 3.0])) if drive == "geared" else 1.0
+    lines, stated = [], {}
+    for k in range(n):
+        limit = 1.5 * (load[k] + friction[k])
+        more = f' forcerange="{_words(-limit, limit)}"' if drive == "limited" else ""
+        more += ' timeconst="0.03"' if drive == "filtered" else ""
+        gains = f'kp="{kp[k] / gear**2:.6g}" kv="{kv[k] / gear**2:.6g}" gear="{gear:g}"'
+        law = f'gainprm="{kp[k]:.6g}" biastype="affine" biasprm="{_words(0.05 * load[k], -kp[k], -kv[k])}"'
+        one = f'general name="m{k}" joint="j{k}" {law}'
+        lines.append(f"<{one}/>" if drive == "general" else f'<position name="m{k}" joint="j{k}" {gains}{more}/>')
+        stated[f"j{k}"] = {"kind": "position", "kp": float(f"{kp[k]:.6g}"), "kd": float(f"{kv[k]:.6g}")}
+    lines = [lines[k] for k in (rng.permutation(n) if rng.random() < 0.3 else range(n))]
+    off = np.ones((3, n)) if rng.random() < 0.25 else rng.uniform(0.6, 1.7, (3, n))
+    real = text(armature, damping, friction, "".join(lines))
+    filed = [x * y for x, y in zip((armature, damping, friction), off, strict=True)]
+    file = text(filed[0], filed[1], filed[2], "" if drive == "stated" else "".join(lines))
+    letters = "".join("s" if s else "h" for s in slides)
+    branched = " branched" if parent != [k - 1 for k in range(n)] else ""
+    told = (
+        f"{n} joints {letters}{branched}, {mounted}{', geoms' * geoms}{', zeros' * zeros},"
+        f" {drive} drives{f' {gear:g}' if gear != 1 else ''}, file {'exact' if (off == 1).all() else 'off'}"
+    )
+    names = [f"j{k}" for k in range(n)]
+    return Robot(real, file, names, travel, friction, load, stated if drive == "stated" else {}, told)
+
+
+def _words(*numbers: float) -> str:
+    return " ".join(f"{x:.6g}" for x in numbers)
+
+
+def _sizes(model: Any, zero: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Typical inertia and weight felt at each joint."""
+    data, n = MADE.MjData(model), model.nv
+    inertias, weights = [], []
+    for _ in range(20):
+        data.qpos[:] = zero + rng.uniform(-0.5, 0.5, n)
+        MADE.mj_forward(model, data)
+        dense = np.zeros((n, n))
+        MADE.mj_fullM(model, data, dense)
+        inertias.append(np.diag(dense).copy())
+        weights.append(np.abs(data.qfrc_bias))
+    return np.mean(inertias, 0), np.mean(weights, 0)
+
+
+def _command(rng: np.random.Generator, robot: Robot, motion: str, seconds: float, period: float) -> np.ndarray:
+    """Commanded offsets from the start (rows, joints), at rest at the beginning."""
+    n, t = len(robot.names), np.arange(round(seconds / period))[:, None] * period
+    waves = 0.5 * np.sin(2 * np.pi * rng.uniform(0.1, 0.4, n) * t + rng.uniform(0, 6, n))
+    waves += 0.25 * np.sin(2 * np.pi * rng.uniform(0.5, 1.2, n) * t + rng.uniform(0, 6, n))
+    held = round(0.8 / period)
+    steps = np.repeat(rng.uniform(-0.5, 0.5, (len(t) // held + 1, n)), held, 0)[: len(t)]
+    moved = waves + 0.2 * steps if motion == "waves" else steps
+    if motion == "one after another":
+        turn = (t[:, 0] / seconds * n).astype(int).clip(0, n - 1)
+        moved = np.where(np.arange(n) == turn[:, None], waves, 0.0)
+    return robot.ranges * moved * np.clip(t / 0.5, 0, 1)
+
+
+def _moved(
+    robot: Robot, option: str, u: np.ndarray, rows: int, hidden: tuple[str, int, float]
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """Positions and velocities at the command's rows; None where the loop is not stable."""
+    model = MADE.MjModel.from_xml_string(robot.text.replace("<option", f"<option {option}"))
+    effect, j, size = hidden
+    step, dofs = model.opt.timestep, [int(model.joint(name).dofadr[0]) for name in robot.names]
+    if effect == "payload":
+        _loaded(model, 0.08 * size)
+    if effect == "gravity_tilt":
+        model.opt.gravity[:] = _tilted(model.opt.gravity.copy(), 0.03 * size)
+    data = MADE.MjData(model)
+    drives = [int(model.actuator(f"m{name[1:]}").id) for name in robot.names]
+    gears = np.array([model.actuator_gear[a, 0] for a in drives])
+    start = data.qpos[dofs].copy()
+    u[:] = start + u
+    data.qpos[dofs] = u[0]
+    late = round(0.01 * size / step) if effect == "command_delay" else 0
+    q, v = np.zeros_like(u), np.zeros_like(u)
+    held = np.repeat(u, rows, 0)
+    friction = robot.friction
+    for k in range(len(held)):
+        now, rate = data.qpos[dofs].copy(), data.qvel[dofs].copy()
+        if k % rows == 0:
+            q[k // rows], v[k // rows] = now, rate
+        wanted = held[k].copy()
+        if late:
+            wanted[j] = held[max(k - late, 0), j]
+        if effect == "dead_band":
+            band = 0.006 * size * robot.ranges[j] / 0.5
+            error = wanted[j] - now[j]
+            wanted[j] -= np.clip(error, -band, band)
+        data.ctrl[drives] = wanted * gears
+        if effect == "stribeck_friction":
+            model.dof_frictionloss[dofs[j]] = friction[j] * (
+                1 + 0.6 * size * np.exp(-((rate[j] / 0.2 / robot.ranges[j] * 0.5) ** 2))
+            )
+        if effect == "load_dependent_friction":
+            MADE.mj_forward(model, data)
+            load = abs(data.qfrc_actuator[dofs[j]] + data.qfrc_bias[dofs[j]])
+            model.dof_frictionloss[dofs[j]] = 0.5 * friction[j] + 0.12 * size * load
+        if effect == "joint_spring":
+            data.qfrc_applied[dofs[j]] = (
+                -0.15 * size * robot.weights[j] / robot.ranges[j] * (now[j] - start[j] - 0.1 * robot.ranges[j])
+            )
+        if effect == "torque_ripple":
+            data.qfrc_applied[dofs[j]] = -0.1 * size * robot.weights[j] * np.sin(12.0 * now[j] / robot.ranges[j] + 0.9)
+        MADE.mj_step(model, data)
+        if not np.isfinite(data.qpos).all() or np.abs(data.qpos).max() > 10:
+            return None, v
+    u *= gears
+    return q, v
+
+
+def _loaded(model: Any, mass: float) -> None:
+    """A point mass at the last body's end, in the model's numbers."""
+    b = model.nbody - 1
+    old, at = float(model.body_mass[b]), model.body_ipos[b].copy()
+    place = 2.0 * at
+    turn = np.zeros(9)
+    MADE.mju_quat2Mat(turn, model.body_iquat[b])
+    turn = turn.reshape(3, 3)
+    whole = turn @ np.diag(model.body_inertia[b]) @ turn.T
+
+    def point(m: float, r: np.ndarray) -> np.ndarray:
+        return m * (r @ r * np.eye(3) - np.outer(r, r))
+
+    middle = (old * at + mass * place) / (old + mass)
+    whole = whole + point(old, at - middle) + point(mass, place - middle)
+    values, vectors = np.linalg.eigh(whole)
+    if np.linalg.det(vectors) < 0:
+        vectors[:, 0] *= -1
+    quaternion = np.zeros(4)
+    MADE.mju_mat2Quat(quaternion, vectors.ravel())
+    model.body_mass[b], model.body_ipos[b] = old + mass, middle
+    model.body_inertia[b], model.body_iquat[b] = values, quaternion
+    MADE.mj_setConst(model, MADE.MjData(model))
+
+
+def _tilted(gravity: np.ndarray, angle: float) -> np.ndarray:
+    """Gravity turned about an axis across it."""
+    across = np.cross(gravity, [0.3, 1.0, 0.5])
+    across /= np.linalg.norm(across)
+    return np.cos(angle) * gravity + np.sin(angle) * np.cross(across, gravity)
+
+
+def answered(case: Case, jobs: list[str]) -> tuple[list[str], list[str]]:
+    """How each command did, in a word and in a line."""
+    marks, lines = [], []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for k, arrays in enumerate(case.recordings):
+            np.savez(folder / f"run{k}.npz", **arrays)  # pyright: ignore[reportArgumentType]
+        (folder / "robot.xml").write_text(case.file)
+        (folder / "task.yaml").write_text(yaml.safe_dump(case.task))
+        for job in jobs:
+            said, began = io.StringIO(), time.process_time()
+            with (
+                contextlib.redirect_stdout(said),
+                contextlib.redirect_stderr(said),
+                warnings.catch_warnings(record=True) as noted,
+            ):
+                warnings.simplefilter("always")
+                status = command_line([job, str(folder / "task.yaml"), "--out", str(folder / job), "--quiet"])
+            used = f", {time.process_time() - began:.0f} CPU s"
+            if status:
+                marks.append("error")
+                lines.append(f"{job}: {status} {' '.join(said.getvalue().split())[-600:]}{used}")
+                continue
+            mark, line = (_diagnosed if job == "diagnose" else _identified)(case, folder / job)
+            marks.append("warning" if noted else mark)
+            lines.append(f"{job}: {line}{used}" + "".join(f"; {one.message}" for one in noted[:1]))
+    return marks, lines
+
+
+def _diagnosed(case: Case, out: Path) -> tuple[str, str]:
+    answer = json.loads((out / "answer.json").read_text())
+    names = [(c["effect"], " ".join(c["at"])) for c in answer["causes"]]
+    sets = [[(o["effect"], " ".join(o["at"])) for o in c["ambiguous_with"]] for c in answer["causes"]]
+    fair = [
+        _same(one, case.truth) or any(_same(o, case.truth) for o in also) for one, also in zip(names, sets, strict=True)
+    ]
+    right = any(_same(one, case.truth) for one in names)
+    mark = "wrong" if not all(fair) else "right" if right else "set" if any(fair) else answer["verdict"]
+    line = f"{answer['verdict']}, {', '.join(' '.join(one) for one in names) or 'no cause'}"
+    line += f"; alike {sets}" if any(sets) else ""
+    if answer["verdict"] == "unknown":
+        line += "".join(f"; {x['effect']} {' '.join(x['at'])}: {x['why_not']}" for x in answer["rest"]["nearest"])
+    error = (answer["residual"][key] for key in ("before", "after", "noise"))
+    ratios = [f"{before / noise:.3g} -> {after / noise:.3g}" for before, after, noise in zip(*error, strict=True)]
+    return mark, f"{line}; of the noise {', '.join(ratios)}"
+
+
+def _same(name: tuple[str, str], truth: tuple[str, str] | None) -> bool:
+    """Whether a name is the truth; a load may be told at any link that moves alike, and as a link's own mass."""
+    if truth is None:
+        return False
+    loads = ("payload", "link_inertia")
+    return name == truth or (name[0] in loads and truth[0] in loads)
+
+
+def _identified(case: Case, out: Path) -> tuple[str, str]:
+    result = json.loads((out / "result.json").read_text())
+    return "done", json.dumps({k: result[k] for k in list(result)[:4]})[:300]
+
+
+if __name__ == "__main__":
+    main()
