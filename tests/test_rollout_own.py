@@ -256,7 +256,7 @@ def test_a_base_that_is_not_level_is_identified(tmp_path: Path):
     """Gravity along x by the base that leans, of a servo in MuJoCo C."""
     (tmp_path / "servo.xml").write_text(SERVO)
     model = mujoco.MjModel.from_xml_string(SERVO)
-    model.opt.gravity[:] = [0.6, 0.0, -9.81]
+    model.opt.gravity[:] = [0.6, 0.0, -np.sqrt(9.81**2 - 0.6**2)]
     data, u = mujoco.MjData(model), command(3000)
     q = np.zeros(len(u))
     for k, row in enumerate(u):

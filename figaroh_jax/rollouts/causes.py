@@ -16,7 +16,7 @@ from ..effects.loops import InRollouts, Scale
 from ..rigid.model import Frame, Joint, RobotModel
 from .loop import Joints, Loop, Pairs
 from .own import is_own, starts_of
-from .parameters import TEN, Entry, Table
+from .parameters import TEN, TILT, Entry, Table
 
 __all__ = [
     "BASELINE",
@@ -113,7 +113,7 @@ def catalogue(
         table.append(Entry("payload", (i,)))
         candidates += _wanted(kinds, "link", (joint.link,), i, Scale(0.0, 0.0))
     if _stands(loop):
-        table += [Entry("gravity_x", (0,)), Entry("gravity_y", (0,))]
+        table += [Entry(name, (0,)) for name in TILT]
         candidates += _wanted(kinds, "robot", (), 0, Scale(0.0, 0.0))
     for k, (i, j, _) in enumerate(loop.pairs.at if loop.pairs is not None else ()):
         table += [Entry(number, (k,)) for number in _PAIR_ENTRIES]

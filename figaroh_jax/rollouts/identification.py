@@ -20,7 +20,7 @@ from .data import Run, as_recorded
 from .fit import Fit, System, fit, standard_errors
 from .loop import Loop
 from .own import is_own
-from .parameters import BOUNDS, OF_DRIVES, TEN, put, unit_of
+from .parameters import BOUNDS, OF_DRIVES, TEN, TILT, put, unit_of
 from .setting import Setting, Structure, begun, coloured, level_of, rms_of_rows
 from .task import (
     all_slide,
@@ -174,7 +174,7 @@ def _links(here: Setting, first: Fit) -> list[dict[str, Any]]:
 def _expression(here: Setting, entry: int) -> str:
     one = here.known.table[entry]
     names, place = here.loop.robot.dof_names, one.at[0]
-    if one.name in ("gravity_x", "gravity_y"):
+    if one.name in TILT:
         return one.name
     if one.name.startswith("pair_") and here.loop.pairs is not None:
         return f"{one.name} {', '.join(names[k] for k in here.loop.pairs.at[place][:2])}"

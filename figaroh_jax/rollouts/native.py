@@ -21,7 +21,7 @@ from ..compiled.batching import on_host
 from ..compiled.machine_code import is_gnu, library
 from .loop import Loop
 from .own import is_own, silent
-from .parameters import TEN, Table, unit_payload
+from .parameters import TEN, TILT, Table, tilt_slope, tilted, unit_payload
 
 if TYPE_CHECKING:
     from .sensitivity import Windows
@@ -35,7 +35,7 @@ _JOINT = (
 _PLAIN = _JOINT[:14]  # what a table may name
 _DRIVE = ("scale", "delay", "dead_band", "voltage")
 _KINDS = {name: k for k, name in enumerate(_PLAIN)} | {name: 100 + k for k, name in enumerate(_DRIVE)}
-_KINDS |= {"force_limit": 110, "kp": 111, "kd": 112, "gravity_x": 201, "gravity_y": 201, "payload": 200}
+_KINDS |= {"force_limit": 110, "kp": 111, "kd": 112, "payload": 200} | dict.fromkeys(TILT, 201)
 _KINDS |= dict.fromkeys(TEN, 200)
 _PAIR = ("pair_inertia", "pair_damping", "pair_friction")
 _KINDS |= {name: 120 + k for k, name in enumerate(_PAIR)}
@@ -122,7 +122,8 @@ class native:
 
     def _run(self, theta: np.ndarray, free: list[int], start: np.ndarray, out: dict[str, np.ndarray]) -> None:
         loop, data = self.loop, self.data
-        given, arrays = _Given(), self.arrays | self._numbers_at(np.asarray(theta, float)) | self._unknowns(free)
+        theta = np.asarray(theta, float)
+        given, arrays = _Given(), self.arrays | self._numbers_at(theta) | self._unknowns(theta, free)
         arrays |= {"begin": np.ascontiguousarray(start, float)} | out
         longs = {
             "n": loop.robot.nv, "nu": len(loop.drives.names), "ny": len(loop.measured),
@@ -146,7 +147,7 @@ class native:
         own = {name: x.copy() for name, x in self.numbers.items()}
         for entry, value in zip(self.table, theta, strict=True):
             at = list(entry.at)
-            if is_own(entry.name):
+            if is_own(entry.name) or entry.name in TILT:
                 continue
             if entry.name in _PLAIN:
                 own["joint"][_PLAIN.index(entry.name), at] = value
@@ -164,24 +165,35 @@ class native:
                 own["payload"][at] = value
             elif entry.name == "payload":
                 own["inertia"][at] += value * self.unit_payload[at]
-            elif entry.name in TEN:
-                own["inertia"][at, TEN.index(entry.name)] += value
             else:
-                own["gravity"][0 if entry.name == "gravity_x" else 1] = value
+                own["inertia"][at, TEN.index(entry.name)] += value
+        if any(self._leans(theta)):
+            with jax.enable_x64(True):
+                own["gravity"] = np.array(tilted(self.loop.robot.gravity, *self._leans(theta)))
         return own
 
-    def _unknowns(self, free: Sequence[int]) -> dict[str, np.ndarray]:
-        kind, place, column, ten = [], [], [], []
+    def _leans(self, theta: np.ndarray) -> list[float]:
+        """How far gravity leans, m/s2 along both axes across it."""
+        told = {entry.name: float(theta[k]) for k, entry in enumerate(self.table)}
+        return [told.get(name, 0.0) for name in TILT]
+
+    def _unknowns(self, theta: np.ndarray, free: Sequence[int]) -> dict[str, np.ndarray]:
+        kind, place, column, ten, pulls = [], [], [], [], np.zeros((3, 2))
+        if any(self.table[k].name in TILT for k in free):
+            with jax.enable_x64(True):
+                pulls = np.asarray(tilt_slope(self.loop.robot.gravity, *self._leans(theta)))
         for c, k in enumerate(free):
             entry = self.table[k]
             carried = entry.name == "payload" and self.loop.carried is not None
             for at in entry.at:
                 kind.append(_CARRIED_PAYLOAD if carried else _KINDS[entry.name])
-                place.append({"gravity_x": 0, "gravity_y": 1}.get(entry.name, at))
+                place.append(at)
                 column.append(c)
                 unit = np.zeros(10)
                 if entry.name in TEN:
                     unit[TEN.index(entry.name)] = 1.0
+                elif entry.name in TILT:
+                    unit[:3] = pulls[:, TILT.index(entry.name)]
                 elif entry.name == "payload" and not carried:
                     unit = self.unit_payload[at]
                 ten.append(unit)

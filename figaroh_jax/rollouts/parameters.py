@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..effects.base import joint_unit
+from ..effects.environment import level_axes
 from . import own
 from .loop import Loop, turns
 
@@ -25,12 +26,15 @@ __all__ = [
     "OF_DRIVES",
     "OF_SEVERAL",
     "TEN",
+    "TILT",
     "UNITS",
     "Entry",
     "Table",
     "current",
     "of_one_number",
     "put",
+    "tilt_slope",
+    "tilted",
     "uncoupled",
     "unit_of",
     "unit_payload",
@@ -40,7 +44,8 @@ __all__ = [
 _PAIRS = {"pair_inertia": "inertia", "pair_damping": "damping", "pair_friction": "friction"}  # fields of `Pairs`
 _DRIVES = ("scale", "delay", "dead_band", "voltage", "time_constant")  # fields of `Drives`
 OF_DRIVES = (*_DRIVES, "force_limit", "kp", "kd")  # places that are drives
-OF_SEVERAL = ("payload", "gravity_x", "gravity_y", *_PAIRS)  # numbers that several joints show
+TILT = ("gravity_x", "gravity_y")  # m/s2 of gravity along `level_axes`: it is turned, not made longer
+OF_SEVERAL = ("payload", *TILT, *_PAIRS)  # numbers that several joints show
 
 
 class Entry(NamedTuple):
@@ -103,7 +108,7 @@ BOUNDS = _Known({  # what such a number can be
     "ripple_order": (0.5, 40.0), "scale": (1e-3, 1e3), "delay": (0.0, 0.15), "dead_band": (0.0, 0.5),
     "voltage": (1e-4, 1e6), "force_limit": (1e-4, 1e6), "time_constant": (1e-4, 2.0), "payload": (-50.0, 50.0),
     "kp": (1e-6, 1e6), "kd": (0.0, 1e5), "reading": (-0.5, 0.5), "offset": _ANY, "rest": _ANY, "ripple_sine": _ANY,
-    "ripple_cosine": _ANY, "gravity_x": (-9.0, 9.0), "gravity_y": (-9.0, 9.0), **dict.fromkeys(_PAIRS, (0.0, 1e4)),
+    "ripple_cosine": _ANY, "gravity_x": (-6.5, 6.5), "gravity_y": (-6.5, 6.5), **dict.fromkeys(_PAIRS, (0.0, 1e4)),
     **dict.fromkeys(TEN, _ANY),
 }, own.bounds_of)  # fmt: skip
 
@@ -120,7 +125,7 @@ def unit_of(loop: Loop, entry: Entry) -> str:
 
 
 def values(loop: Loop, table: Table) -> np.ndarray:
-    """The numbers of the table in a loop (a payload is 0, as are those of `TEN`: they are what is added).
+    """The numbers of the table in a loop (a payload is 0, as are those of `TEN` and `TILT`: they are what is added).
 
     NaN where an entry has no place (`of_one_number`).
     """
@@ -144,8 +149,7 @@ def _get(loop: Loop, name: str, xp: Any = np) -> Any:
         "force_limit": lambda: xp.asarray(drives.force_range)[:, 1],
         "payload": lambda: xp.zeros(len(loop.robot.joints) if loop.carried is None else len(loop.carried.payload)),
         **dict.fromkeys(TEN, lambda: xp.zeros(len(loop.robot.joints))),
-        "gravity_x": lambda: xp.asarray(loop.robot.gravity)[:1],
-        "gravity_y": lambda: xp.asarray(loop.robot.gravity)[1:2],
+        **dict.fromkeys(TILT, lambda: xp.zeros(1)),
     }
     if name in special:
         return special[name]()
@@ -155,7 +159,11 @@ def _get(loop: Loop, name: str, xp: Any = np) -> Any:
 def put(loop: Loop, table: Table, theta: Array | np.ndarray) -> Loop:
     """The loop with the table's numbers; differentiable in `theta`."""
     with jax.enable_x64(True):
-        for name in dict.fromkeys(entry.name for entry in table):
+        leans = {entry.name: theta[k] for k, entry in enumerate(table) if entry.name in TILT}
+        if leans:
+            turned = tilted(loop.robot.gravity, *(leans.get(name, 0.0) for name in TILT))
+            loop = eqx.tree_at(lambda m: m.robot.gravity, loop, turned)
+        for name in dict.fromkeys(entry.name for entry in table if entry.name not in TILT):
             pairs = [(place, k) for k, entry in enumerate(table) if entry.name == name for place in entry.at]
             at, which = (np.array(x) for x in zip(*pairs, strict=True))
             loop = _put(loop, name, at, theta[which])
@@ -181,9 +189,6 @@ def _put(loop: Loop, name: str, at: np.ndarray, new: Array | np.ndarray) -> Loop
         return eqx.tree_at(
             lambda m: m.robot.inertia, loop, jnp.asarray(loop.robot.inertia).at[at, TEN.index(name)].add(new)
         )
-    if name in ("gravity_x", "gravity_y"):
-        k = 0 if name == "gravity_x" else 1
-        return eqx.tree_at(lambda m: m.robot.gravity, loop, jnp.asarray(loop.robot.gravity).at[k].set(new[0]))
     if name == "force_limit":
         limits = jnp.asarray(loop.drives.force_range).at[at].set(jnp.stack([-new, new], 1))
         return eqx.tree_at(lambda m: m.drives.force_range, loop, limits)
@@ -196,6 +201,23 @@ def _put(loop: Loop, name: str, at: np.ndarray, new: Array | np.ndarray) -> Loop
     group = "drives" if name in _DRIVES else "joints"
     old = jnp.asarray(getattr(getattr(loop, group), name))
     return eqx.tree_at(lambda m: getattr(getattr(m, group), name), loop, old.at[at].set(new))
+
+
+def tilted(gravity: Any, x: Any, y: Any) -> Array:
+    """Gravity (3,), m/s2, turned so that `x` and `y` of it are along its `level_axes`."""
+    g, flat = jnp.asarray(gravity), jnp.stack([jnp.asarray(x), jnp.asarray(y)])
+    return _upright(g, flat) * g + level_axes(g) @ flat
+
+
+def tilt_slope(gravity: Any, x: Any, y: Any) -> Array:
+    """Derivatives (3, 2) of `tilted` by its two numbers."""
+    g, flat = jnp.asarray(gravity), jnp.stack([jnp.asarray(x), jnp.asarray(y)])
+    return level_axes(g) - jnp.outer(g, flat) / (jnp.maximum(g @ g, 1e-300) * _upright(g, flat))
+
+
+def _upright(g: Array, flat: Array) -> Array:
+    """The share of gravity that stays where it was: its length is the same."""
+    return jnp.sqrt(jnp.maximum(1 - flat @ flat / jnp.maximum(g @ g, 1e-300), 1e-6))
 
 
 def uncoupled(loop: Loop, table: Table, thetas: Any, frees: Any) -> Loop:

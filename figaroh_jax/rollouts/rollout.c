@@ -279,7 +279,7 @@ APART void unit_torques(const Given *g, const Rigid *w, const int n, const long 
     D F[MOST][6];
     for (int i = n - 1; i >= 0; i--) {
       D a[6] = {{0}};
-      a[3 + g->place[k]] -= 1;
+      for (int x = 0; x < 3; x++) a[3 + x] -= g->ten[10 * k + x]; /* by which gravity turns */
       inertial(w->body[i].m, w->body[i].h, w->body[i].J, a, F[i]); /* of all that it carries */
       out[g->coordinate[i]] = dot6(w->body[i].S, F[i]);
     }

@@ -24,7 +24,7 @@ from . import lanes, own
 from .friction import Solution
 from .loop import Linear, Loop, State, Step, advance, integrated, mobility, observe
 from .native import native
-from .parameters import TEN, Table, put, unit_payload
+from .parameters import TEN, TILT, Table, put, tilt_slope, unit_payload
 from .simulation import delayed
 
 __all__ = ["Sums", "Windows", "began", "by_kernel", "linear_sums", "predicted", "read_of", "state_size"]
@@ -360,16 +360,17 @@ class _RigidBody:
     def _columns(self, loop: Loop, robot: RobotModel, a: Array) -> Array:
         """What a unit of each number of the rigid body adds to the torques, (numbers, 3, nv, samples)."""
         q, v, zero = self.linear.q, self.linear.v, jnp.zeros_like(self.linear.v)
-        found, still = [], jnp.zeros(3)
+        found, told = [], {entry.name: self.theta[k] for k, entry in enumerate(self.table)}
+        leaning = tilt_slope(loop.robot.gravity, *(told.get(name, 0.0) for name in TILT))
         for entry in (self.table[k] for k in self.which):
-            if entry.name not in _PULLS:
+            if entry.name not in TILT:
                 at, ten = np.array(entry.at), jnp.zeros_like(jnp.asarray(robot.inertia))
                 unit = unit_payload(loop, at) if entry.name == "payload" else np.eye(10)[TEN.index(entry.name)]
                 ten = ten.at[at].set(unit)
                 body = eqx.tree_at(lambda r: r.inertia, robot, ten)
                 found.append(jnp.stack([joint_torques(body, q, v, one) for one in a]))
             else:
-                pulled = eqx.tree_at(lambda r: r.gravity, robot, still.at["xy".index(entry.name[-1])].set(1.0))
+                pulled = eqx.tree_at(lambda r: r.gravity, robot, leaning[:, TILT.index(entry.name)])
                 found.append(jnp.broadcast_to(joint_torques(pulled, q, zero, zero), a.shape))
         return jnp.stack(found)
 
@@ -399,8 +400,7 @@ def _by_directions(robot: RobotModel, q: Array, v: Array, a: Array) -> Slopes:
     )
 
 
-_PULLS = ("gravity_x", "gravity_y")
-_OF_BODY = ("payload", *TEN, *_PULLS)
+_OF_BODY = ("payload", *TEN, *TILT)
 
 
 def _spread(a: Array, b: Array, spread: Array, substeps: int) -> tuple[Array, Array]:

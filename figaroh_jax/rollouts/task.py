@@ -65,7 +65,6 @@ EFFECTS = {  # parameters of effects and the fields of `Joints` that hold them
 _SAME = {effect.name: called for called, effect in ROLLOUTS.items() if called != effect.name}
 _WINDOW, _OPEN = 15.0, 1.0  # s
 _FAR = 1e3  # rad or m: a simulation that gets there has diverged
-_G = 9.81  # m/s2, as `GravityTilt.physical`
 _TURN = 12.0  # a command that many times beyond what the joint did is in other units
 
 
@@ -462,10 +461,9 @@ def _cause(one: Named, found: Search, here: Setting, told: dict[Name, str]) -> C
     if first.name == "pair_inertia" and here.loop.pairs is not None:
         parameters["sign"] = Estimate(float(here.loop.pairs.at[first.at[0]][2]), 0.0, "")
     if one.candidate.effect == "gravity_tilt":  # as angles
-        x, y = (parameters[name] for name in ("x", "y"))
-        parameters = {
-            "about_x": Estimate(-y.value / _G, y.std / _G, "rad"), "about_y": Estimate(x.value / _G, x.std / _G, "rad")
-        }  # fmt: skip
+        pull = float(np.linalg.norm(here.loop.robot.gravity))
+        x, y = ((np.arcsin(parameters[name].value / pull), parameters[name].std / pull) for name in ("x", "y"))
+        parameters = {"about_x": Estimate(-y[0], y[1], "rad"), "about_y": Estimate(*x, "rad")}
     name, at = Name(one.candidate.effect, one.candidate.at), one.candidate.at
     sure = 1.0 / (1 + len(one.alike)) * (0.98 if found.verdict == "named" else 0.8)
     gain = Gain(one.before, one.after, "m" if _slides(here.loop, at) else "rad")

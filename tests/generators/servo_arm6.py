@@ -68,7 +68,8 @@ def model_text(
     j, share = coupled
     tendon = "" if share == 0 else (f'<tendon><fixed armature="{share * ARMATURE[j]:.6g}" damping="{share * DAMPING[j]:.6g}" frictionloss="{share * FRICTION[j]:.6g}">'
         f'<joint joint="{NAMES[j]}" coef="1"/><joint joint="{NAMES[j + 1]}" coef="1"/></fixed></tendon>')  # fmt: skip
-    pull = f"{9.81 * np.sin(tilt / 2):.9g} {-9.81 * np.sin(tilt):.9g} -9.81"
+    x, y = np.sin(tilt / 2), -np.sin(tilt)
+    pull = f"{9.81 * x:.9g} {9.81 * y:.9g} {-9.81 * np.sqrt(1 - x**2 - y**2):.9g}"
     return (f'<mujoco><compiler angle="radian"/><option timestep="{DT}" integrator="implicitfast" gravity="{pull}"><flag contact="disable"/></option>'
             f"<worldbody>{body}{ends}</worldbody>{tendon}<actuator>{drives}</actuator></mujoco>")  # fmt: skip
 
