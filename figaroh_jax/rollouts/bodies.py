@@ -64,11 +64,14 @@ def searched_with_bodies(
 ) -> Search:
     """What a search has found; where it leaves a rest, the search with the inertia of links fitted if that is better.
 
-    `link_inertia` is named at every link that recordings left out bear out, before all other causes.
+    `link_inertia` is named at every link that recordings left out bear out, before all other causes. So it is in place
+    of a payload and more, where it leaves noise alone with fewer causes: a load is seldom at the link's centre of mass.
     """
+    progress("asking whether links are as heavy as the file says", 0.9)
+    if (fewer := _in_place_of_a_load(seek, here, found, progress, forbid)) is not None:
+        return fewer
     if not _is_asked(here, found, forbid):
         return found
-    progress("asking whether links are as heavy as the file says", 0.9)
     before = found.setting or here
     plain = _rigid(here, found)
     sound = replace(before, loop=plain.structure.loop)
@@ -83,12 +86,38 @@ def searched_with_bodies(
     return _better(before.loop, whole, found, some, other, links)
 
 
+def _in_place_of_a_load(
+    seek: Seek, here: Setting, found: Search, progress: Callable[[str, float], None], forbid: Sequence[str]
+) -> Search | None:
+    """The search with links from the baseline on, where it has fewer causes than one with a payload, and no rest."""
+    causes = found.named or found.proxy
+    loaded = len(causes) > 1 and any(n.candidate.effect == "payload" for n in causes)
+    if not (loaded and _may_have_links(found, forbid) and found.origin is not None):
+        return None
+    sound = replace(found.setting or here, loop=found.origin.loop)
+    whole, plain = with_bodies(sound, range(len(sound.loop.robot.joints))), _Rigid(found.origin, found.first)
+    links, model, _ = _links(thinned(whole), plain)
+    if not 0 < len(links) < len(causes):
+        return None
+    some = _freed(sound, whole, plain, links, model)
+    other = seek(some, progress, forbid=forbid)
+    known = np.isfinite(other.last.cost) and len(other.structure.table) == len(some.known.table)
+    if not known or other.verdict not in ("nothing", "named") or len(links) + len(other.named) >= len(causes):
+        return None
+    new = _better((found.setting or here).loop, whole, found, some, other, links, fewer=True)
+    return new if new is not found else None
+
+
+def _may_have_links(found: Search, forbid: Sequence[str]) -> bool:
+    """Whether links may be the reason for what a search has found."""
+    loop = found.structure.loop
+    plain = loop.carried is None and all(joint.kind in ("revolute", "prismatic") for joint in loop.robot.joints)
+    return plain and bool(np.isfinite(found.last.cost)) and EFFECT not in forbid
+
+
 def _is_asked(here: Setting, found: Search, forbid: Sequence[str]) -> bool:
     """Whether a rest is left in a robot whose links may be the reason."""
-    loop = found.structure.loop
-    rest = found.verdict in ("unknown", "named+rest") and np.isfinite(found.last.cost)
-    plain = loop.carried is None and all(joint.kind in ("revolute", "prismatic") for joint in loop.robot.joints)
-    return rest and plain and EFFECT not in forbid
+    return found.verdict in ("unknown", "named+rest") and _may_have_links(found, forbid)
 
 
 class _Rigid(NamedTuple):
@@ -369,8 +398,13 @@ def _freed(sound: Setting, whole: Setting, found: _Rigid, links: Sequence[Link],
     return replace(whole, loop=loop, baseline=(*kept, *entries), width=sound.width + len(entries))
 
 
-def _better(filed: Loop, whole: Setting, found: Search, some: Setting, other: Search, links: Sequence[Link]) -> Search:
-    """The search with links of their own inertia where rows that were not fitted bear it out, else that before."""
+def _better(
+    filed: Loop, whole: Setting, found: Search, some: Setting, other: Search, links: Sequence[Link], fewer: bool = False
+) -> Search:
+    """The search with links of their own inertia where rows that were not fitted bear it out, else that before.
+
+    `fewer`: where it leaves noise alone; it has fewer causes.
+    """
     sound = other.setting or some
     if other.verdict == "unknown":
         baseline_alone(sound, other)
@@ -380,9 +414,10 @@ def _better(filed: Loop, whole: Setting, found: Search, some: Setting, other: Se
         return found
     other.last = last.fit
     part = thinned(sound)
-    before, after = (_stands(part, x.structure, x.last) for x in (found, other))
+    old = (found.origin, found.first) if fewer and found.origin is not None else (found.structure, found.last)
+    before, after = _stands(part, *old), _stands(part, other.structure, other.last)
     gain, t, enough = borne_out(part, before, after, MOST_OF_A_REST)
-    if not enough:
+    if not enough or (fewer and after.excess.max() >= 1.0):
         return found
     structure, last = _as_filed(whole, some, other)
     numbers = {number: name for name, number in ROLLOUTS[EFFECT].in_rollouts.numbers}
