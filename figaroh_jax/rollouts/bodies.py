@@ -15,8 +15,9 @@ import equinox as eqx
 import numpy as np
 
 from ..effects.catalogue import ROLLOUTS
+from ..errors import InputError
 from ..estimation.conic import NotConverged
-from ..estimation.consistency import bodies, inconsistencies, project
+from ..estimation.consistency import bodies, inconsistencies, physical_fit, project
 from ..estimation.told import ABOUT_JOINT, beside, bodies_with, inertia_about_joint, sizes, told_numbers
 from ..results import Name
 from .arm import baseline_alone
@@ -47,6 +48,7 @@ __all__ = [
 EFFECT = "link_inertia"
 _LOOKS = 4  # at most, at which numbers are told
 _NO_OTHER = 1e-5  # of what a number does: what others cannot do as well, where it is one of them
+_NEARER = 4  # times at most that the nearest links are looked for where the last ones were
 _EARLY = 0.25  # of a window's rows, that are fitted first
 _TRIED = 3  # links that are fitted in a round
 _MOST = 80  # iterations: links that are far off take many
@@ -338,7 +340,8 @@ def nearest_bodies(here: Setting, model: Model, links: Sequence[Link]) -> Model 
     """The model with the nearest links that bodies can have, all else fitted again; None where none is found.
 
     Nearest by what the recordings tell. What they do not tell of a link is free to follow: a mass that stands as the
-    file has it may be too small for an inertia that was found.
+    file has it may be too small for an inertia that was found. Told numbers may hold what belongs to others that are
+    told with them alone: so the nearest in all ten is looked for as well, and the better one taken.
     """
     structure, last, loop = model.structure, model.fit, model.structure.loop
     if not np.isfinite(last.cost):
@@ -347,6 +350,54 @@ def nearest_bodies(here: Setting, model: Model, links: Sequence[Link]) -> Model 
     places = [link.at for link in links]
     if not inconsistencies(ten[places], [names[i] for i in places]):
         return model
+    near = [_nearest_in_told(here, model, links, ten), _nearest_in_all(here, model, links)]
+    return min((x for x in near if x is not None), key=lambda x: x.fit.squares, default=None)
+
+
+def _nearest_in_all(here: Setting, model: Model, links: Sequence[Link]) -> Model | None:
+    """The nearest links by all ten numbers of each, what is not told near the file's."""
+    loop, table, _ = model.structure
+    places, theta, start = [link.at for link in links], model.fit.theta.copy(), model.fit.start
+    entries = [k for i in places for k in _entries(here, i)]
+    others = [k for k in model.free if k not in entries]
+    every = bodies(loop.robot)
+    mine = [replace(every[i], columns=tuple(range(10 * k, 10 * k + 10))) for k, i in enumerate(places)]
+    scale, filed = sizes(loop.robot)[places].ravel(), np.asarray(loop.robot.inertia)[places].ravel()
+    columns, best = [*others, *entries], None
+    for _ in range(_NEARER):
+        one = fit(*model.structure, theta[None], [columns], start[None], width=len(columns), lanes=1, iterations=0)[0]
+        if not np.isfinite(one.cost):
+            break
+        matrix, right = System(one.sums, model.structure.data, one.start).reduced(1e-6)
+        own = list(range(len(others), len(columns)))
+        information, score = beside(matrix, right, own, list(range(len(others))))
+        values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+        seen = values > 1e-12 * values[-1]
+        root = np.sqrt(values[seen])
+        rows = np.concatenate([root[:, None] * vectors.T[seen], np.sqrt(_level(model)) * np.eye(len(scale))]) / scale
+        away = np.concatenate([vectors.T[seen] @ (scale * score) / root, np.zeros(len(scale))])
+        now = np.asarray(put(loop, table, theta).robot.inertia)[places].ravel()
+        begun = np.concatenate([rows[: len(root)] @ now, rows[len(root) :] @ filed])
+        try:
+            ten = physical_fit(np.column_stack([rows, begun + away]), mine).ravel()
+        except (InputError, NotConverged):
+            break
+        theta[entries] += ten - now
+        one = _fitted(here, model.structure, theta, others, start)
+        if best is not None and not one.squares < best.squares:
+            break
+        best, theta, start = one, one.theta.copy(), one.start
+    if best is None:
+        return None
+    last = fit(*model.structure, best.theta[None], [model.free], best.start[None],
+               width=max(here.width, len(model.free)), lanes=1, iterations=0)[0]  # fmt: skip
+    return model._replace(fit=last) if np.isfinite(last.cost) else None
+
+
+def _nearest_in_told(here: Setting, model: Model, links: Sequence[Link], ten: np.ndarray) -> Model | None:
+    """The nearest links by the numbers that are told, all others free to follow."""
+    structure, last, loop = model.structure, model.fit, model.structure.loop
+    places = [link.at for link in links]
     columns, entries = [int(k) for k in last.free if k >= 0], [k for link in links for k in link.entries]
     own, others = ([columns.index(k) for k in ks] for ks in (entries, [k for k in columns if k not in entries]))
     information, _ = beside(*System(last.sums, structure.data, last.start).reduced(1e-6), own, others)
