@@ -54,6 +54,7 @@ class Robot(NamedTuple):
     file: str
     names: list[str]  # of the joints, in the order of the file
     ranges: np.ndarray  # rad or m that the joints travel about their start
+    slides: np.ndarray
     friction: np.ndarray  # N m or N
     weights: np.ndarray  # the same, of gravity and inertia at the joints
     stated: dict[str, Any]  # drives that the task states, for a file that has none
@@ -118,11 +119,13 @@ def drawn(rng: np.random.Generator, args: argparse.Namespace) -> Case | None:
         q, v = _moved(robot, option, u, every_rows, (effect, j, size))
         if q is None:
             return None
-        read = q + (noise * rng.standard_normal(q.shape) if not counts else 0.0)
+        sizes = np.where(robot.slides, 0.16, 1.0)  # a joint that slides has .08 m where others have .5 rad
+        read = q + (sizes * noise * rng.standard_normal(q.shape) if not counts else 0.0)
         if effect == "encoder_offset":
-            read[:, j] += 0.02 * size
+            read[:, j] += 0.02 * size * sizes[j]
         if counts:
-            read = np.round(read * counts / (2 * np.pi)) * 2 * np.pi / counts
+            step = sizes * 2 * np.pi / counts
+            read = np.round(read / step) * step
         recordings.append({"q": read, "u": u, "dq": v})
     start = float(rng.choice([0.0, 0.0, 17.3, 1.7e9]))
     order = rng.permutation(n) if rng.random() < 0.5 else np.arange(n)
@@ -207,15 +210,15 @@ def _robot(rng: np.random.Generator, most: int, kinds: list[str]) -> Robot:
     damping, travel = 0.3 * kv, np.where(slides, 0.08, 0.5)
     load = weight + whole * travel * 4.0
     friction = load * rng.uniform(0.03, 0.25, n)
-    drive = str(rng.choice(kinds))
+    drive, strong = str(rng.choice(kinds)), float(rng.choice([1.5, 3.0]))
     gear = float(rng.choice([0.5, 3.0])) if drive == "geared" else 1.0
     lines, stated = [], {}
     for k in range(n):
-        limit = 1.5 * (load[k] + friction[k])
+        limit = strong * (load[k] + friction[k])
         more = f' forcerange="{_words(-limit, limit)}"' if drive == "limited" else ""
         more += ' timeconst="0.03"' if drive == "filtered" else ""
         gains = f'kp="{kp[k] / gear**2:.6g}" kv="{kv[k] / gear**2:.6g}" gear="{gear:g}"'
-        law = f'gainprm="{kp[k]:.6g}" biastype="affine" biasprm="{_words(0.05 * load[k], -kp[k], -kv[k])}"'
+        law = f'gainprm="{kp[k]:.6g}" biastype="affine" biasprm="{_words(0.0, -kp[k], -kv[k])}"'
         one = f'general name="m{k}" joint="j{k}" {law}'
         lines.append(f"<{one}/>" if drive == "general" else f'<position name="m{k}" joint="j{k}" {gains}{more}/>')
         stated[f"j{k}"] = {"kind": "position", "kp": float(f"{kp[k]:.6g}"), "kd": float(f"{kv[k]:.6g}")}
@@ -231,7 +234,7 @@ def _robot(rng: np.random.Generator, most: int, kinds: list[str]) -> Robot:
         f" {drive} drives{f' {gear:g}' if gear != 1 else ''}, file {'exact' if (off == 1).all() else 'off'}"
     )
     names = [f"j{k}" for k in range(n)]
-    return Robot(real, file, names, travel, friction, load, stated if drive == "stated" else {}, told)
+    return Robot(real, file, names, travel, slides, friction, load, stated if drive == "stated" else {}, told)
 
 
 def _words(*numbers: float) -> str:

@@ -25,7 +25,20 @@ from .parameters import put, values
 from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_of_entry, outputs, sprung_now, tried_now
 from .search import TOO_LITTLE, Model, Named, Search, Tried, all_but, judged_by_colour, sized, t_of, why_not_sized
 from .sensitivity import predicted
-from .setting import Setting, Structure, begins_of, begun, by_recording, evened, free_entries, level_of, thinned
+from .setting import (
+    Setting,
+    Structure,
+    begins_of,
+    begun,
+    begun_by_parts,
+    by_recording,
+    evened,
+    far_off,
+    free_entries,
+    in_parts,
+    level_of,
+    thinned,
+)
 from .shared import at_all_joints, t_together
 from .sizes import fitted_without, simpler
 from .steady import in_doubt
@@ -44,8 +57,44 @@ def search_arm(
     here: Setting, progress: Callable[[str, float], None] = lambda phase, share: None, *, forbid: Sequence[str] = ()
 ) -> Search:
     """Causes of an arm whose drives act at one joint each and whose joints are all measured."""
-    found = _searched(here, progress, forbid)
+    found = _by_parts(here, _searched(here, progress, forbid), progress, forbid)
     return judged_by_colour(here, found, lambda again: _by_colour(again, found, forbid))
+
+
+def _by_parts(here: Setting, found: Search, progress: Callable[[str, float], None], forbid: Sequence[str]) -> Search:
+    """A search; where it has ended far from noise, the causes of one in short windows, if noise alone is left by them.
+
+    What a long simulation has lost sight of, as where a drive's limit lets a joint fall, shows no cause.
+    """
+    here, origin = found.setting or here, found.origin
+    if found.verdict != "unknown" or origin is None or not np.isfinite(found.last.cost):
+        return found
+    if not far_off(here, found.first) or len(in_parts(here).stretches) == len(here.stretches):
+        return found
+    progress("searching for causes in short windows", 0.9)
+    short = _searched(in_parts(here), lambda phase, share: None, forbid)
+    if short.verdict not in ("nothing", "named"):
+        return found
+    free = [int(k) for k in short.last.free if k >= 0]
+    structure = short.structure._replace(data=here.cut(short.structure.loop))
+    one = fit(*structure, short.last.theta[None], [free], width=max(here.width, len(free)), lanes=1)[0]
+    now = standing(here, structure, one, free)
+    if not now.excess.max() < 1.0:
+        return found
+    begin = standing(here, origin, found.first, here.baseline)
+    return _ended(here, found, short.named, now, begin)
+
+
+def _ended(here: Setting, search: Search, found: list[Named], now: Standing, begin: Standing) -> Search:
+    """A search that ends with these causes, of which noise alone is left."""
+    found, now, slight = still_needed(here, found, now, begin)
+    found, now = _alike(here, found, now) if slight is None else (found, now)
+    held = [rms_of(here, begin.held), rms_of(here, now.held)]
+    label = ", ".join(str(Name(n.candidate.effect, n.candidate.at)) for n in found)
+    steps = [("baseline", _level(here, search.first)), (label, _level(here, now.model.fit))]
+    told = Search("nothing", found, now.model.structure, search.first, now.model.fit, search.p_value, [], [], steps,
+                  held, [now.model.fit], search.origin, here, search.faults)  # fmt: skip
+    return _judged(here, told, now, slight)
 
 
 def _by_colour(here: Setting, white: Search, forbid: Sequence[str]) -> Search:
@@ -67,14 +116,7 @@ def _by_colour(here: Setting, white: Search, forbid: Sequence[str]) -> Search:
         now = standing(here, structure, one, free)
         if not now.excess.max() < 1.0:
             continue
-        found, now, slight = still_needed(here, found, now, begin)
-        found, now = _alike(here, found, now) if slight is None else (found, now)
-        held = [rms_of(here, begin.held), rms_of(here, now.held)]
-        label = ", ".join(str(Name(n.candidate.effect, n.candidate.at)) for n in found)
-        steps = [("baseline", _level(here, new.first)), (label, _level(here, now.model.fit))]
-        told = Search("nothing", found, now.model.structure, new.first, now.model.fit, new.p_value, [], [], steps, held,
-                      [now.model.fit], new.origin, here)  # fmt: skip
-        return _judged(here, told, now, slight)
+        return _ended(here, new, found, now, begin)
     return new
 
 
@@ -283,9 +325,9 @@ def _begun(here: Setting) -> Fit:
         fit(*structure, x[None], [here.baseline], y[None], width=here.width, lanes=1, rough=ROUGH, iterations=most)[0]
         for x, y, most in ((theta, start, LATE), (best.theta, best.start, 0))
     )
-    if mixed.cost < usual.cost:
-        return mixed
-    return fit(*structure, best.theta[None], [here.baseline], best.start[None], width=here.width, lanes=1)[0]
+    if not mixed.cost < usual.cost:
+        mixed = fit(*structure, best.theta[None], [here.baseline], best.start[None], width=here.width, lanes=1)[0]
+    return begun_by_parts(here, mixed)
 
 
 def _judged(here: Setting, result: Search, now: Standing, slight: Slight | None = None) -> Search:

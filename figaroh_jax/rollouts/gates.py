@@ -23,6 +23,7 @@ from .thresholds import (
     NO_WORSE,
     SLIGHT,
     SMALL,
+    SURE_OF_NOISE,
     T_BESIDE_REST,
     T_WITHOUT_REST,
     UNTOLD,
@@ -122,7 +123,9 @@ def checked(here: Setting, now: Standing, new: Standing, one: Tried) -> tuple[bo
     needed = T_BESIDE_REST if rest and not (usual and gain > GAIN_BESIDE_REST) else sure
     worth = GAIN_BESIDE_REST if rest and not usual else GAIN
     state = Model(new.model.structure, new.model.fit, new.model.free, 0.0)
-    good = gain > worth and t > needed and sized(here, one._replace(state=state))
+    fitted = (now.squares - new.squares)[..., mine].sum()
+    enough = float(now.excess[mine].max()) >= 1.0 or fitted > SURE_OF_NOISE
+    good = gain > worth and t > needed and enough and sized(here, one._replace(state=state))
     return bool(good), float(gain), t
 
 

@@ -44,6 +44,7 @@ from .thresholds import (
     NO_WORSE,
     OF_ITS_SIZE,
     SLIGHT,
+    SURE_OF_NOISE,
     T_BESIDE_REST,
     T_WITHOUT_REST,
     UNTOLD,
@@ -489,10 +490,14 @@ def _best(
     common = [t.candidate.kind.usual and g > GAIN_BESIDE_REST for t, g in zip(tried, gains, strict=True)]
     needs = [T_BESIDE_REST if rest and not usual else sure for rest, usual in zip(beside, common, strict=True)]
     worth = [GAIN_BESIDE_REST if r and not t.candidate.kind.usual else GAIN for r, t in zip(beside, tried, strict=True)]
-    passing = [k for k in range(len(tried)) if gains[k] > worth[k] and ts[k] > needs[k] and sized(here, tried[k])]
+    least = 0.0 if now.excess >= 1.0 else SURE_OF_NOISE
+    enough = [
+        g > w and t > n and now.fit.squares - one.state.fit.squares > least
+        for g, w, t, n, one in zip(gains, worth, ts, needs, tried, strict=True)
+    ]
+    passing = [k for k in range(len(tried)) if enough[k] and sized(here, tried[k])]
     for k in np.argsort(gains)[::-1][:3]:
-        enough = gains[k] > worth[k] and ts[k] > needs[k]
-        why = TOO_LITTLE if not enough else why_not_sized(here, tried[k]) or "no better than another"
+        why = TOO_LITTLE if not enough[k] else why_not_sized(here, tried[k]) or "no better than another"
         nearest.append((Name(tried[k].candidate.effect, tried[k].candidate.at), float(max(gains[k], 0.0)), why))
     if not passing:
         return None, p

@@ -15,24 +15,27 @@ from ..effects.catalogue import CATALOGUE
 from ..errors import InputError, nearest
 from .causes import Candidate, Catalogue, catalogue, with_pairs
 from .colour import colour_of, filtered
-from .data import Run, Stretch, noise_of, windows
+from .data import Run, Stretch, noise_of, regular, windows
 from .fit import Fit, fit
 from .loop import Loop
 from .own import everywhere, placed
 from .parameters import BOUNDS, Table, values
 from .sensitivity import Windows, predicted
-from .thresholds import POWER, SLOW, SLOW_ROWS, TO_TRY
+from .thresholds import HALF_A_STEP, POWER, SLOW, SLOW_ROWS, TO_TRY
 
 __all__ = [
     "Setting",
     "Structure",
     "begins_of",
     "begun",
+    "begun_by_parts",
     "by_recording",
     "coloured",
     "evened",
     "excess",
+    "far_off",
     "free_entries",
+    "in_parts",
     "largest_forces",
     "level_of",
     "residuals",
@@ -48,6 +51,8 @@ _ROUGH = 1e-3  # share of the squares that a step of such a start must promise
 _ENOUGH = 6000  # rows of an arm's recordings that a search is made on; the more are asked at the end
 _SHORTEST = 100  # rows of a window that is shortened for that
 _EARLY = 4  # iterations of a race among all starts
+_FAR_OFF = 9.0  # times the noise's power, from which a baseline is begun by short windows as well
+_PART, _LEAST, _ENDS = 0.5, 20, 15  # s and least rows of such a window; iterations of their fit
 
 
 @dataclass(frozen=True)
@@ -261,14 +266,18 @@ def coloured(here: Setting, structure: Structure, found: Fit) -> Setting | None:
 def excess(error: np.ndarray, share: np.ndarray) -> float:
     """How many times what noise may reach the whitened residual is: its power, and that of its means over 25 rows.
 
-    Rows in which a counter stands, which have one `share`, have one error: their mean is as large as each of them.
+    Rows in which a counter stands, which have one `share`, have one error: their mean is as large as each of them. No
+    position is further from such a reading than half a step: what is, is none of its noise in any of the rows.
     """
     count = share.sum()
     power = ((error**2).sum() / count - 1) / np.sqrt(6 / count)
     rows = len(error) // SLOW_ROWS * SLOW_ROWS
     means = error[:rows].reshape(-1, SLOW_ROWS, *error.shape[1:]).sum(1) / np.sqrt(SLOW_ROWS)
     parts = share[:rows].reshape(-1, SLOW_ROWS, *error.shape[1:])
-    full = (parts > 0).all(1)
+    full, most = (parts > 0).all(1), parts.max(1)
+    standing = full & (most <= 1 / SLOW_ROWS)
+    off = np.abs(means) / np.sqrt(SLOW_ROWS * np.where(standing, most, 1.0))  # of the noise, by which the mean is off
+    means = np.hypot(means, np.where(standing, np.sqrt(SLOW_ROWS) * np.maximum(off - HALF_A_STEP, 0.0), 0.0))
     due = np.minimum(parts.sum(1)[full], 1.0)  # of a counter that stands for k rows: 25 / k, where k is more than 25
     slow = ((means[full] ** 2).sum() - due.sum()) / np.sqrt(4 * (due**2).sum()) if full.any() else 0.0
     return float(max(power / POWER, slow / SLOW))
@@ -286,6 +295,10 @@ def by_recording(here: Setting) -> bool:
 
 def begun(here: Setting) -> Fit:
     """The baseline's fit."""
+    return begun_by_parts(here, _begun(here))
+
+
+def _begun(here: Setting) -> Fit:
     begins: Any = begins_of(here, values(here.loop, here.known.table))
     structure = Structure(here.loop, here.known.table, here.data)
     sizes: Any = {"width": here.width, "lanes": here.lanes}
@@ -297,6 +310,47 @@ def begun(here: Setting) -> Fit:
     fits = fit(*structure, states[0], [here.baseline] * len(order), states[1], rough=_ROUGH, **sizes)
     best = min(fits, key=lambda f: f.cost)
     return fit(*structure, best.theta[None], [here.baseline], best.start[None], **sizes)[0]
+
+
+def begun_by_parts(here: Setting, found: Fit) -> Fit:
+    """A baseline's fit; where it leaves much more than noise, the better one of it and of one begun by short windows.
+
+    A long simulation that a drive's limit, or friction, holds up leads to numbers that no step leaves again; from the
+    measured states at the starts of many short ones it does not.
+    """
+    if not np.isfinite(found.cost) or not far_off(here, found):
+        return found
+    some = in_parts(here)
+    if len(some.stretches) == len(here.stretches):
+        return found
+    sizes: Any = {"width": here.width, "lanes": here.lanes}
+    short, filed = Structure(here.loop, here.known.table, some.data), np.asarray(values(here.loop, here.known.table))
+    (early,) = fit(*short, filed[None], [here.baseline], iterations=_ENDS, rough=_ROUGH, **sizes)
+    if not np.isfinite(early.cost):
+        return found
+    whole = Structure(here.loop, here.known.table, here.data)
+    (again,) = fit(*whole, early.theta[None], [here.baseline], **sizes)
+    return again if again.cost < found.cost else found
+
+
+def in_parts(here: Setting) -> Setting:
+    """The setting in short windows; the same where it is so already. Its folds are quarters of each recording."""
+    rows = max(round(_PART / regular(here.runs[0].name, here.runs[0].time)), _LEAST)
+    parts = [
+        Stretch(one.run, first, min(rows, one.first + one.rows - first))
+        for one in here.stretches
+        for first in range(one.first, one.first + one.rows - _LEAST + 1, rows)
+    ]
+    some = replace(here, stretches=tuple(parts) if len(parts) > len(here.stretches) else here.stretches)
+    data = some.cut(here.loop)
+    blocks = data.reading.shape[0] // data.block
+    quarter = np.array([4 * one.first // len(here.runs[one.run].time) for one in some.stretches])
+    return replace(some, data=data, folds=np.broadcast_to(quarter, (blocks, len(quarter))).copy())
+
+
+def far_off(here: Setting, found: Fit) -> bool:
+    """Whether a fit leaves much more than noise."""
+    return level_of(found, np.asarray(here.data.share)) > _FAR_OFF
 
 
 def begins_of(here: Setting, theta: np.ndarray) -> np.ndarray:
