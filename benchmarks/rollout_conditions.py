@@ -124,8 +124,8 @@ def drawn(rng: np.random.Generator, args: argparse.Namespace) -> Case | None:
         if effect == "encoder_offset":
             read[:, j] += 0.02 * size * sizes[j]
         if counts:
-            step = sizes * 2 * np.pi / counts
-            read = np.round(read / step) * step
+            resolution = sizes * 2 * np.pi / counts
+            read = np.round(read / resolution) * resolution
         recordings.append({"q": read, "u": u, "dq": v})
     start = float(rng.choice([0.0, 0.0, 17.3, 1.7e9]))
     order = rng.permutation(n) if rng.random() < 0.5 else np.arange(n)

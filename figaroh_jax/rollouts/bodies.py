@@ -48,6 +48,7 @@ __all__ = [
 EFFECT = "link_inertia"
 _LOOKS = 4  # at most, at which numbers are told
 _NO_OTHER = 1e-5  # of what a number does: what others cannot do as well, where it is one of them
+_AS_GOOD = 1.001  # times the squares of a fit, up to which links that bodies can have leave as little
 _NEARER = 4  # times at most that the nearest links are looked for where the last ones were
 _EARLY = 0.25  # of a window's rows, that are fitted first
 _TRIED = 3  # links that are fitted in a round
@@ -341,7 +342,7 @@ def nearest_bodies(here: Setting, model: Model, links: Sequence[Link]) -> Model 
 
     Nearest by what the recordings tell. What they do not tell of a link is free to follow: a mass that stands as the
     file has it may be too small for an inertia that was found. Told numbers may hold what belongs to others that are
-    told with them alone: so the nearest in all ten is looked for as well, and the better one taken.
+    told with them alone: where they leave more, the nearest in all ten is looked for as well, and the better one taken.
     """
     structure, last, loop = model.structure, model.fit, model.structure.loop
     if not np.isfinite(last.cost):
@@ -350,8 +351,11 @@ def nearest_bodies(here: Setting, model: Model, links: Sequence[Link]) -> Model 
     places = [link.at for link in links]
     if not inconsistencies(ten[places], [names[i] for i in places]):
         return model
-    near = [_nearest_in_told(here, model, links, ten), _nearest_in_all(here, model, links)]
-    return min((x for x in near if x is not None), key=lambda x: x.fit.squares, default=None)
+    near = _nearest_in_told(here, model, links, ten)
+    if near is not None and near.fit.squares < _AS_GOOD * last.squares:
+        return near
+    both = [x for x in (near, _nearest_in_all(here, model, links)) if x is not None]
+    return min(both, key=lambda x: x.fit.squares, default=None)
 
 
 def _nearest_in_all(here: Setting, model: Model, links: Sequence[Link]) -> Model | None:
