@@ -34,7 +34,10 @@ class Instead(NamedTuple):
 
 
 def instead(here: Setting, now: Standing, named: Named, found: Sequence[Named]) -> list[Instead]:
-    """Causes at the same joint that leave noise alone in place of a named one, the best first."""
+    """Causes at the same joint, or of several, that leave noise alone in place of a named one, the best first.
+
+    In place of one of several joints also those of any joint.
+    """
     tried = [*_beside(here, now, named, found), *_told(here, now, named)]
     good = sorted((x for x in tried if x.worse < NO_CHOICE), key=lambda x: x.worse)
     return [x for x in good if not any(x.candidate.kind.holds(other.candidate.effect) for other in good)]
@@ -75,7 +78,7 @@ def _beside(here: Setting, now: Standing, named: Named, found: Sequence[Named]) 
     j, others = joint_of(here, mine), {(n.candidate.effect, n.candidate.at) for n in found}
     left = [
         c for c in here.known.candidates
-        if joint_of(here, c) == j and (c.effect, c.at) not in others
+        if (j < 0 or joint_of(here, c) in (j, -1)) and (c.effect, c.at) not in others
         and not c.kind.limit and not set(c.entries) & set(now.model.free) and not c.kind.holds(mine.effect)
     ]  # fmt: skip
     if not left:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -24,7 +24,9 @@ from .setting import (
     by_recording,
     coloured,
     excess,
+    far_off,
     free_entries,
+    in_parts,
     largest_forces,
     level_of,
     residuals,
@@ -74,6 +76,7 @@ _SHORT = 6  # candidates that are fitted where a linear screening can order them
 _CHECKED = 3  # candidates whose held-out squares are those of fits without some recordings
 _ROOM = 120  # columns beside what is free that one linearisation takes: each is a fiftieth of the first
 _LEAST_ROOM, _SUMS = 24, 2.5e7  # columns that it takes at least; numbers of its matrices by blocks of time
+_OUT_OF_SIGHT = 4.0  # times the squares of a fit, beyond which those of rows left out are no linear step's
 _SHORTER = 4  # of one joint of an arm
 _MOST, _MOST_ONE = 6, 4  # causes, and where only a rest that is noise gives them a name
 _EARLY, _LATE = 4, 30  # iterations of a race among all starts, and of its leaders
@@ -163,8 +166,30 @@ def search(
     begin: Fit | None = None,
 ) -> Search:
     """Baseline, then one cause after another while held-out data gain; what is left decides the verdict."""
-    found = _searched(here, progress, forbid, begin)
+    found = _by_parts(here, _searched(here, progress, forbid, begin), progress, forbid)
     return judged_by_colour(here, found, lambda again: _searched(again, lambda phase, share: None, forbid))
+
+
+def _by_parts(here: Setting, found: Search, progress: Callable[[str, float], None], forbid: Sequence[str]) -> Search:
+    """A search; where it has ended far from noise, one in short windows, if it leaves noise alone in whole ones too."""
+    lost = found.verdict == "unknown" and np.isfinite(found.last.cost) and far_off(here, found.first)
+    if not lost or len(in_parts(here).stretches) == len(here.stretches):
+        return found
+    progress("searching for causes in short windows", 0.9)
+    short = _searched(in_parts(here), lambda phase, share: None, forbid)
+    if short.verdict != "named":
+        return found
+    structure = short.structure._replace(data=here.cut(short.structure.loop))
+    free = [int(k) for k in short.last.free if k >= 0]
+    last = fit(*structure, short.last.theta[None], [free], width=max(here.width, len(free)), lanes=1)[0]
+    if not np.isfinite(last.cost) or excess(whitened(structure, last), np.asarray(structure.data.share)) >= 1.0:
+        return found
+    held = [found.held[0], _rms(here, held_out(last, here.folds))]
+    named = [one._replace(before=held[0], after=held[1]) for one in short.named]
+    label = ", ".join(str(Name(one.candidate.effect, one.candidate.at)) for one in named)
+    levels = [found.table[0], (label, level_of(last, np.asarray(structure.data.share)))]
+    more = {"first": found.first, "last": last, "p_value": found.p_value, "origin": found.origin, "fits": [last]}
+    return replace(short, structure=structure, named=named, table=levels, held=held, setting=None, **more)
 
 
 def _searched(
@@ -531,7 +556,10 @@ def _held_out(here: Setting, now: Model, tried: Sequence[Tried]) -> tuple[list[T
     """The candidates that fit best, and the squares of the present model, held out by fits without some recordings."""
     tried = list(tried)
     if not by_recording(here) or here.loop.robot.nv > 1:
-        return tried, held_out(now.fit, here.folds)
+        before = _without_folds(here, now, held_out(now.fit, here.folds))
+        for k in sorted(range(len(tried)), key=lambda k: tried[k].state.fit.cost)[:_CHECKED]:
+            tried[k] = tried[k]._replace(sse=_without_folds(here, tried[k].state, tried[k].sse))
+        return tried, before
     order = sorted(range(len(tried)), key=lambda k: tried[k].state.fit.cost)[:_CHECKED]
     same = [k for k in order if tried[k].state.structure is now.structure]
     fits = [now.fit, *(tried[k].state.fit for k in same)]
@@ -543,6 +571,13 @@ def _held_out(here: Setting, now: Model, tried: Sequence[Tried]) -> tuple[list[T
             found[k] = refitted_without(*one.structure, [one.fit], here.folds, lanes=6)[0]
         tried[k] = tried[k]._replace(sse=found[k])
     return tried, before
+
+
+def _without_folds(here: Setting, now: Model, held: np.ndarray) -> np.ndarray:
+    """Held-out squares by one linear step, or by a few damped ones where that leads out of sight."""
+    if not held.sum() > _OUT_OF_SIGHT * now.fit.squares or not np.isfinite(now.fit.cost):
+        return held
+    return refitted_without(*now.structure, [now.fit], here.folds, lanes=here.lanes)[0]
 
 
 def _rms(here: Setting, squares: np.ndarray) -> float:
