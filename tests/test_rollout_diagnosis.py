@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import equinox as eqx
@@ -83,7 +84,8 @@ TWO = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="
 <actuator><position joint="j1" kp="60" kv="2"/><position joint="j2" kp="40" kv="1"/></actuator></mujoco>"""
 
 
-def test_sums_of_two_joints_are_those_of_finite_differences(tmp_path: Path):
+@pytest.mark.parametrize("turned", [False, True])
+def test_sums_of_two_joints_are_those_of_finite_differences(tmp_path: Path, turned: bool):
     """Numbers of joints, drives, sensors and of the rigid body itself, all free at once."""
     (tmp_path / "arm.xml").write_text(TWO)
     loop, _ = load_loop(tmp_path / "arm.xml")
@@ -91,9 +93,14 @@ def test_sums_of_two_joints_are_those_of_finite_differences(tmp_path: Path):
     u = 0.3 * np.sin(t[:, None] * [4.0, 7.0] + [0.0, 1.0])
     run = Run("two", t, u, 0.9 * u, np.gradient(0.9 * u, t, axis=0))
     data = windows(loop, [run], [Stretch(0, 0, 300)], [np.full(2, 2e-4), np.full(2, 5e-3)], 0.2)
-    at = {"armature": 0, "delay": 1, "friction": 0, "payload": 1, "mass_x": 0, "inertia_yy": 1, "gravity_x": 0}
+    if turned:
+        loop = replace(loop, robot=replace(loop.robot, gravity=np.array([-5.0, 7.0, 4.6])))
+    at = {"armature": 0, "delay": 1, "friction": 0, "payload": 1, "mass_x": 0, "inertia_yy": 1}
+    at |= {"gravity_x": 0, "gravity_y": 0}
     table = tuple(Entry(name, (place,)) for name, place in at.items())
-    theta = np.array([0.06, 0.0051, 0.2, 0.1, 0.02, 0.004, 0.3])
+    theta = np.array([0.06, 0.0051, 0.2, 0.1, 0.02, 0.004, 0.3, 2.0])
+    length = [np.linalg.norm(x.robot.gravity) for x in (loop, put(loop, table, theta))]
+    assert length[1] == pytest.approx(length[0], rel=1e-12)  # it is turned
     start = np.array([[0.03], [0.1], [0.4], [-0.2]])
 
     def squares(theta: np.ndarray) -> float:

@@ -47,6 +47,7 @@ __all__ = [
 
 EFFECT = "link_inertia"
 _LOOKS = 4  # at most, at which numbers are told
+_COUPLED = "coupled_transmission"
 _NO_OTHER = 1e-5  # of what a number does: what others cannot do as well, where it is one of them
 _AS_GOOD = 1.001  # times the squares of a fit, up to which links that bodies can have leave as little
 _NEARER = 4  # times at most that the nearest links are looked for where the last ones were
@@ -92,23 +93,31 @@ def searched_with_bodies(
 def _in_place_of_a_load(
     seek: Seek, here: Setting, found: Search, progress: Callable[[str, float], None], forbid: Sequence[str]
 ) -> Search | None:
-    """The search with links from the baseline on, where it has fewer causes than one with a payload, and no rest."""
+    """The search with links from the baseline on, where it has fewer causes than one with a payload, and no rest.
+
+    Inertia that two joints share may be that of a link: where one link alone does as well, a coupling is told with it.
+    """
     causes = found.named or found.proxy
-    loaded = len(causes) > 1 and any(n.candidate.effect == "payload" for n in causes)
-    if not (loaded and _may_have_links(found, forbid) and found.origin is not None):
+    effects = {n.candidate.effect for n in causes}
+    asked = ("payload" in effects and len(causes) > 1) or (found.verdict == "named" and _COUPLED in effects)
+    if not (asked and _may_have_links(found, forbid) and found.origin is not None):
         return None
     sound = replace(found.setting or here, loop=found.origin.loop)
     whole, plain = with_bodies(sound, range(len(sound.loop.robot.joints))), _Rigid(found.origin, found.first)
     links, model, _ = _links(thinned(whole), plain)
-    if not 0 < len(links) < len(causes):
+    if not 0 < len(links) <= len(causes):
         return None
     some = _freed(sound, whole, plain, links, model)
     other = seek(some, progress, forbid=forbid)
     known = np.isfinite(other.last.cost) and len(other.structure.table) == len(some.known.table)
-    if not known or other.verdict not in ("nothing", "named") or len(links) + len(other.named) >= len(causes):
+    if not known or other.verdict not in ("nothing", "named") or len(links) + len(other.named) > len(causes):
         return None
     new = _better((found.setting or here).loop, whole, found, some, other, links, fewer=True)
-    return new if new is not found else None
+    if new is found or len(new.named) < len(causes):
+        return new if new is not found else None
+    told = tuple(Name(n.candidate.effect, n.candidate.at) for n in new.named if n.candidate.effect == EFFECT)
+    both = [n._replace(alike=(*n.alike, *told)) if n.candidate.effect == _COUPLED else n for n in found.named]
+    return replace(found, named=both) if found.verdict == "named" else None
 
 
 def _may_have_links(found: Search, forbid: Sequence[str]) -> bool:
@@ -464,12 +473,12 @@ def _better(
     if other.verdict == "unknown":
         baseline_alone(sound, other)
     free = tuple(int(k) for k in other.last.free if k >= 0)
-    last = as_bodies(sound, Model(other.structure, other.last, free, 0.0), links, found.last.squares)
+    old = (found.origin, found.first) if fewer and found.origin is not None else (found.structure, found.last)
+    last = as_bodies(sound, Model(other.structure, other.last, free, 0.0), links, old[1].squares)
     if last is None:
         return found
     other.last = last.fit
     part = thinned(sound)
-    old = (found.origin, found.first) if fewer and found.origin is not None else (found.structure, found.last)
     before, after = _stands(part, *old), _stands(part, other.structure, other.last)
     gain, t, enough = borne_out(part, before, after, MOST_OF_A_REST)
     if not enough or (fewer and after.excess.max() >= 1.0):

@@ -12,9 +12,7 @@ __all__: list[str] = []
 GAIN = 0.004  # of the squares
 CONFIDENT = 1.64  # t, where more than noise is left to explain
 T_WITHOUT_REST = 2.5  # t, where nothing but noise is left
-SURE_OF_NOISE = (
-    16.0  # squares over the noise, by which it is better there: four sigmas of one number, of some fifty asked
-)
+SURE_OF_NOISE = 16.0  # squares over the noise, by which it is better there: four sigmas, for some fifty are asked
 T_BESIDE_REST = 3.0  # t, where more than noise stays beside it
 GAIN_BESIDE_REST = 0.25  # less may stand in for the rest; not of what every joint has
 SMALL = 0.002  # gain below which a cause found with others is not missed
@@ -58,9 +56,7 @@ EXPLAINED = 1.1  # squares of a sample up to which nothing is left to explain by
 POWER = 4.0  # sigmas of the mean square: one sigma is the root of 6 over the rows, fourth differences being as rough
 SLOW = 5.0  # sigmas of the mean square of means of `SLOW_ROWS` rows
 SLOW_ROWS = 25
-HALF_A_STEP = (
-    2.0  # of the noise, by which a counter that stands may be off: it is at least .3 of a step, half a step is 1.7
-)
+HALF_A_STEP = 2.5  # of the noise, which is .3 of a counter's step at least: it stands at most 1.7 off, and a fit errs
 
 # Whether it is coloured noise (`colour`)
 COLOUR = 4.0  # sigmas by which octaves with levels of their own are likelier than a low pass
