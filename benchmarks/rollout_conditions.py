@@ -9,7 +9,7 @@ step and integrator, sampling, first time stamp, number and length of recordings
 another), noise (white or counts), and how far the file's friction, damping and armature are off, also not at all. Half
 of them hide nothing, the others one effect. Everything is made by MuJoCo C and goes through the command line.
 One line a case; at the end tables of verdicts, and every case with a name that is neither the truth nor said to be
-alike, an error or a warning.
+alike, an error or a warning. `identify` of robots that hide nothing is asked whether its 95 % intervals hold the truth.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import collections
 import contextlib
 import io
 import json
+import re
 import tempfile
 import time
 import warnings
@@ -57,6 +58,7 @@ class Robot(NamedTuple):
     slides: np.ndarray
     friction: np.ndarray  # N m or N
     weights: np.ndarray  # the same, of gravity and inertia at the joints
+    numbers: dict[str, float]  # of the joints, as they are, by the names that `identify` gives them
     stated: dict[str, Any]  # drives that the task states, for a file that has none
     told: str
 
@@ -67,7 +69,7 @@ class Case(NamedTuple):
     file: str
     recordings: list[dict[str, np.ndarray]]
     truth: tuple[str, str] | None
-    spread: float
+    numbers: dict[str, float]
 
 
 def main() -> None:
@@ -80,7 +82,7 @@ def main() -> None:
     parser.add_argument("--commands", nargs="+", choices=["diagnose", "identify"], default=["diagnose", "identify"])
     args = parser.parse_args()
     count: collections.Counter[tuple[str, str]] = collections.Counter()
-    odd = []
+    odd, inside = [], list[tuple[int, int]]()
     for seed in range(*args.seeds):
         case = drawn(np.random.default_rng([seed, 77]), args)
         if case is None:
@@ -89,11 +91,15 @@ def main() -> None:
         marks, lines = answered(case, args.commands)
         line = f"{seed}: {case.told}\n    " + "\n    ".join(lines)
         print(line, flush=True)
+        inside += [(int(x), int(n)) for x, n in re.findall(r"(\d+) of (\d+) intervals", line)]
         effect = case.told.split(",", 1)[0].split()[0]
         for job, mark in zip(args.commands, marks, strict=True):
             count[f"{job} {effect}", mark] += 1
         if any(mark in ("wrong", "error", "warning") for mark in marks):
             odd.append(line)
+    if inside:
+        held, all_of = (sum(x) for x in zip(*inside, strict=True))
+        print(f"95 % intervals of `identify` that hold the truth: {held} of {all_of}")
     for (effect, mark), number in sorted(count.items()):
         print(f"{effect:36} {mark:10} {number}")
     print(*odd, sep="\n")
@@ -155,7 +161,7 @@ def drawn(rng: np.random.Generator, args: argparse.Namespace) -> Case | None:
         f"{', velocity' if with_speed else ''}"
     )
     file = robot.file.replace("<option", f"<option {option}")
-    return Case(told, task, file, recordings, (effect, at) if effect != "nothing" else None, noise)
+    return Case(told, task, file, recordings, (effect, at) if effect != "nothing" else None, robot.numbers)
 
 
 def _robot(rng: np.random.Generator, most: int, kinds: list[str]) -> Robot:
@@ -234,7 +240,9 @@ def _robot(rng: np.random.Generator, most: int, kinds: list[str]) -> Robot:
         f" {drive} drives{f' {gear:g}' if gear != 1 else ''}, file {'exact' if (off == 1).all() else 'off'}"
     )
     names = [f"j{k}" for k in range(n)]
-    return Robot(real, file, names, travel, slides, friction, load, stated if drive == "stated" else {}, told)
+    own = {"armature": armature, "damping": damping, "friction": friction}
+    numbers = {f"{called} {name}": float(x[k]) for called, x in own.items() for k, name in enumerate(names)}
+    return Robot(real, file, names, travel, slides, friction, load, numbers, stated if drive == "stated" else {}, told)
 
 
 def _words(*numbers: float) -> str:
@@ -412,7 +420,15 @@ def _same(name: tuple[str, str], truth: tuple[str, str] | None) -> bool:
 
 def _identified(case: Case, out: Path) -> tuple[str, str]:
     result = json.loads((out / "result.json").read_text())
-    return "done", json.dumps({k: result[k] for k in list(result)[:4]})[:300]
+    told = [p for p in result["base_parameters"] if p["status"] == "identified" and p["expression"] in case.numbers]
+    if case.truth is not None:
+        return "done", f"{len(told)} numbers"
+    off = [abs(p["value"] - case.numbers[p["expression"]]) / p["std"] for p in told]
+    held = sum(x < 1.96 for x in off)
+    return (
+        "done",
+        f"{held} of {len(off)} intervals hold the truth, the worst {max(off, default=0.0):.1f} deviations off",
+    )
 
 
 if __name__ == "__main__":
