@@ -29,6 +29,8 @@ DRIVES = ("position", "position", "limited", "geared", "general", "stated")
         pytest.param(30022, 3, [], DRIVES, "right", id="friction, joints that move one after another"),
         pytest.param(30052, 3, [], DRIVES, "right", id="a tilt behind a drive that saturates"),
         pytest.param(32002, 3, ["nothing"], ("limited",), "nothing", id="drives that saturate"),
+        pytest.param(40210, 4, [], DRIVES, "nothing", id="a baseline that ends early"),
+        pytest.param(41206, 4, [], DRIVES, "right", id="a tilt that shows along the joint's axis too"),
         pytest.param(31007, 2, ["payload"], PLAIN, "right", id="a load at the tip, with its own inertia"),
         pytest.param(31019, 2, ["payload"], PLAIN, "right", id="a load that three causes imitate"),
     ],

@@ -10,10 +10,12 @@ from jaxtyping import Array, ArrayLike, Float
 from ..rigid.kinematics import axis_twists, gather, movers, pose_columns, poses_on_host
 from ..rigid.model import RobotModel
 from .base import Effect, Motion, Scalar, amplitude, shape
-from .loops import HERE, InRollouts
+from .loops import InRollouts
 from .registry import register
 
 __all__ = ["Contact", "ExternalWrench", "GravityTilt", "PointEffect", "level_axes"]
+
+_LEANS = 0.05  # m/s2, from which a tilt is fitted: along a joint's axis it shows to second order alone, and not at zero
 
 
 @register
@@ -29,7 +31,7 @@ class GravityTilt(Effect):
     equation = "tau(gravity + (x, y, 0)) - tau(gravity)"
     separated_by = "a full turn of the first joint with the arm stretched, or a level on the base"
     in_rollouts = InRollouts(
-        (("x", "gravity_x"), ("y", "gravity_y")), lambda scale: ((HERE, HERE),), "robot", several=True, together=2,
+        (("x", "gravity_x"), ("y", "gravity_y")), lambda scale: ((_LEANS, _LEANS),), "robot", several=True, together=2,
     )  # fmt: skip
     x: Scalar = amplitude("m/s2")
     y: Scalar = amplitude("m/s2")

@@ -28,6 +28,7 @@ from .sensitivity import predicted
 from .setting import (
     Setting,
     Structure,
+    bare,
     begins_of,
     begun,
     begun_by_parts,
@@ -169,6 +170,10 @@ def _searched(
     begin = standing(here, Structure(here.loop, here.known.table, here.data), first, here.baseline)
     p_value = 1.0 if not np.isfinite(first.cost) else float(max(ndtr(-4 * begin.excess.max()), 1e-12))
     found, now, nearest, (steps, held, fits) = _rounds(here, begin, forbid, progress)
+    if found and now.excess.max() < 1.0 and (alone := bare(here, now.model.fit)) is not None:
+        first, found = alone, list[Named]()
+        begin = now = standing(here, Structure(here.loop, here.known.table, here.data), first, here.baseline)
+        p_value, (steps, held, fits) = 1.0, _Course([("baseline", _level(here, first))], [rms_of(here, now.held)], [])
     progress("judging", 0.9)
     found, now, slight = still_needed(here, found, now, begin)
     found, now = _alike(here, found, now) if slight is None else (found, now)

@@ -19,6 +19,7 @@ from .parameters import values
 from .setting import (
     Setting,
     Structure,
+    bare,
     begins_of,
     begun,
     by_recording,
@@ -217,6 +218,10 @@ def _searched(
         steps.append((str(Name(best[0].candidate.effect, best[0].candidate.at)), level_of(now.fit, share)))
         if now.excess < 1.0:
             break
+    if found and now.excess < 1.0 and (alone := bare(here, now.fit)) is not None:
+        first, found, p_value, steps = alone, [], 1.0, [("baseline", level_of(alone, share))]
+        now = Model(structure, first, here.baseline, excess(whitened(structure, first), share))
+        stood = [now]
     held = [_rms(here, held_out(first, here.folds)), *(n.after for n in found)]
     found, now, doubtful = _of_sure_size(here, now, found, forbid)
     for one, model in doubtful:

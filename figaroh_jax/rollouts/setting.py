@@ -21,11 +21,12 @@ from .loop import Loop
 from .own import everywhere, placed
 from .parameters import BOUNDS, Table, values
 from .sensitivity import Windows, predicted
-from .thresholds import HALF_A_STEP, POWER, SLOW, SLOW_ROWS, TO_TRY
+from .thresholds import HALF_A_STEP, POWER, SLOW, SLOW_ROWS, SURE_OF_NOISE, TO_TRY
 
 __all__ = [
     "Setting",
     "Structure",
+    "bare",
     "begins_of",
     "begun",
     "begun_by_parts",
@@ -51,7 +52,7 @@ _ROUGH = 1e-3  # share of the squares that a step of such a start must promise
 _ENOUGH = 6000  # rows of an arm's recordings that a search is made on; the more are asked at the end
 _SHORTEST = 100  # rows of a window that is shortened for that
 _EARLY = 4  # iterations of a race among all starts
-_FAR_OFF = 9.0  # times the noise's power, from which a baseline is begun by short windows as well
+_OFF, _FAR_OFF = 1.3, 9.0  # times the noise's power, from which a baseline, and a search, is begun by short windows too
 _PART, _LEAST, _ENDS = 0.5, 20, 15  # s and least rows of such a window; iterations of their fit
 
 
@@ -313,12 +314,12 @@ def _begun(here: Setting) -> Fit:
 
 
 def begun_by_parts(here: Setting, found: Fit) -> Fit:
-    """A baseline's fit; where it leaves much more than noise, the better one of it and of one begun by short windows.
+    """A baseline's fit; where it leaves more than noise, the better one of it and of one begun by short windows.
 
     A long simulation that a drive's limit, or friction, holds up leads to numbers that no step leaves again; from the
     measured states at the starts of many short ones it does not.
     """
-    if not np.isfinite(found.cost) or not far_off(here, found):
+    if not np.isfinite(found.cost) or level_of(found, np.asarray(here.data.share)) < _OFF:
         return found
     some = in_parts(here)
     if len(some.stretches) == len(here.stretches):
@@ -331,6 +332,15 @@ def begun_by_parts(here: Setting, found: Fit) -> Fit:
     whole = Structure(here.loop, here.known.table, here.data)
     (again,) = fit(*whole, early.theta[None], [here.baseline], **sizes)
     return again if again.cost < found.cost else found
+
+
+def bare(here: Setting, last: Fit) -> Fit | None:
+    """The baseline's fit from where one with causes has ended, if that leaves hardly more: it had not ended before."""
+    theta, own = np.asarray(values(here.loop, here.known.table)).copy(), list(here.baseline)
+    theta[own] = last.theta[own]
+    structure = Structure(here.loop, here.known.table, here.data)
+    one = fit(*structure, theta[None], [here.baseline], width=here.width, lanes=1)[0]
+    return one if np.isfinite(one.cost) and one.squares < last.squares + SURE_OF_NOISE else None
 
 
 def in_parts(here: Setting) -> Setting:
