@@ -129,7 +129,7 @@ def soft(seconds: float, seed: int, folder: Path) -> None:
     print(f"95 % intervals that hold the truth: {inside} of {len(more)}; {time.process_time() - start:.0f} CPU s")
     data = windows(loop, runs, cut[2:], [np.full(len(JOINTS), NOISE)], 0.3)
     held = fit(here.loop, here.known.table, data, found.theta[None], [[]], width=1, lanes=1)[0]
-    rms = 1e3 * NOISE * np.sqrt(held.squares / np.asarray(data.share).sum())
+    rms = 1e3 * NOISE * np.sqrt(held.squares / (np.asarray(data.weight) > 0).sum())
     print(f"held out: {rms:.3f} mrad, noise {1e3 * NOISE:.3f}")
 
 

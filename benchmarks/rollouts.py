@@ -141,7 +141,10 @@ def dfki_double_pendulum(window: float, every: int) -> None:
         one = fit(loop, table, data["train"], theta[None], [free], start, width=11, lanes=1)[0]
         theta, start = one.theta, one.start[None]
         held = fit(loop, table, data["test"], theta[None], [[]], width=11, lanes=1)[0]
-        rms = [1e3 * np.sqrt(f.squares / d.share.sum()) * 2e-3 for f, d in ((one, data["train"]), (held, data["test"]))]
+        rms = [
+            1e3 * np.sqrt(f.squares / (d.weight > 0).sum()) * 2e-3
+            for f, d in ((one, data["train"]), (held, data["test"]))
+        ]
         values = ", ".join(f"{table[k].name} {theta[k]:.4g}" for k in more)
         print(f"{label:<10} train {rms[0]:7.2f} mrad, held out {rms[1]:7.2f} mrad   {values}", flush=True)
 

@@ -86,7 +86,7 @@ def main() -> None:
                 held += intervals(case, found)
             alike = [str(a) for n in found.named for a in n.alike]
             proxy = "+".join(n.candidate.effect for n in found.proxy)
-            level = found.last.squares / np.asarray(found.structure.data.share).sum()
+            level = found.last.squares / (np.asarray(found.structure.data.weight) > 0).sum()
             print(
                 f"seed {seed} {case}: {verdict}, chi2/N {found.table[0][1]:.3f} -> {level:.3f}, alike {alike},"
                 f" proxy {proxy or '-'}, {seconds:.0f} CPU s",

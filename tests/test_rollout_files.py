@@ -349,7 +349,9 @@ def test_one_error_of_a_robot_counts_joints_of_one_kind(tmp_path: Path):
         pytest.approx(5e-4),
         "m",
     )
-    here: Any = SimpleNamespace(loop=loop, spread=errors, data=SimpleNamespace(share=np.ones((1, 3, 50))))
+    here: Any = SimpleNamespace(
+        loop=loop, spread=errors, data=SimpleNamespace(weight=np.ones((1, 3, 50)), weighed=False)
+    )
     squares = np.full((1, 1, 3), 50.0)  # whitened: each joint's error is its noise
     assert rms_of(here, squares) == pytest.approx(0.02)
     assert rms_of(here, squares, names.index("left")) == pytest.approx(1e-3)

@@ -31,7 +31,7 @@ from .setting import (
     bare,
     begins_of,
     begun,
-    begun_by_parts,
+    by_readings,
     by_recording,
     evened,
     far_off,
@@ -59,6 +59,8 @@ def search_arm(
 ) -> Search:
     """Causes of an arm whose drives act at one joint each and whose joints are all measured."""
     found = _by_parts(here, _searched(here, progress, forbid), progress, forbid)
+    if (again := by_readings(found.setting or here, found.last)) is not None:
+        found = _searched(again, progress, forbid)
     return judged_by_colour(here, found, lambda again: _by_colour(again, found, forbid))
 
 
@@ -332,7 +334,7 @@ def _begun(here: Setting) -> Fit:
     )
     if not mixed.cost < usual.cost:
         mixed = fit(*structure, best.theta[None], [here.baseline], best.start[None], width=here.width, lanes=1)[0]
-    return begun_by_parts(here, mixed)
+    return mixed
 
 
 def _judged(here: Setting, result: Search, now: Standing, slight: Slight | None = None) -> Search:
@@ -636,4 +638,4 @@ def _name(
 
 
 def _level(here: Setting, one: Fit) -> float:
-    return level_of(one, np.asarray(here.data.share))
+    return level_of(one, here.data)

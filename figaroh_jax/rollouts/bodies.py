@@ -449,7 +449,7 @@ def _moved_to_bodies(
 
 def _level(model: Model) -> float:
     """Squares of a row that counts, at least those of noise."""
-    return max(model.fit.squares / max(np.asarray(model.structure.data.share).sum(), 1), 1.0)
+    return max(model.fit.squares / max((np.asarray(model.structure.data.weight) > 0).sum(), 1), 1.0)
 
 
 def _freed(sound: Setting, whole: Setting, found: _Rigid, links: Sequence[Link], now: Standing) -> Setting:

@@ -206,9 +206,8 @@ def windows(
         counted = inside if run.trusted is None else (inside & run.trusted[here].T).T
         parts = [run.position] + ([run.velocity] if len(noise) > 1 and run.velocity is not None else [])
         reading.append(np.concatenate([p[here] for p in parts], 1))
-        told = [counted.reshape(rows, -1) * told_by(p)[here] for p in parts]
-        share.append(np.concatenate(told, 1))
-        weight.append(np.concatenate([np.sqrt(x) / s for x, s in zip(told, noise, strict=False)], 1))
+        share.append(np.concatenate([counted.reshape(rows, -1) * told_by(p)[here] for p in parts], 1))
+        weight.append(np.concatenate([counted.reshape(rows, -1) / s for s in noise], 1))
         rows_of_state = _smooth_rows(run, stretch.first, noise[0]) if smooth else 5
         state, certainty = _state(loop, run, stretch.first, noise, period, rows_of_state)
         start.append(state)

@@ -96,7 +96,7 @@ class _Lanes:
         self.bounds = np.array([BOUNDS[entry.name] for entry in table])
         self.inner = np.full((len(self.theta), self.start.shape[2]), 1e-8)  # damping of each window's start
         self.code = native(loop, table, data)
-        self.rows = max(float(np.asarray(data.share).sum()), 1.0)
+        self.rows = max(int((np.asarray(data.weight) > 0).sum()), 1)
 
     def sums(self, which: np.ndarray, theta: np.ndarray, start: np.ndarray) -> list[Sums]:
         if self.code.usable:

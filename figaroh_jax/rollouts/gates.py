@@ -12,7 +12,7 @@ from .loop import alike
 from .parameters import values
 from .screening import LATE, ROUGH, Standing, excess_of, joint_of, outputs
 from .search import Model, Named, Tried, all_but, sized, t_of, t_of_places, t_of_recordings
-from .setting import Setting, Structure, by_recording
+from .setting import Setting, Structure, by_recording, counted
 from .thresholds import (
     CONFIDENT,
     COST_OF_A_MISSED,
@@ -221,5 +221,5 @@ def rms_of(here: Setting, squares: np.ndarray, joint: int = -1) -> float:
     """
     each = np.maximum(squares.reshape(-1, squares.shape[-1]).sum(axis=0), 0.0) * here.spread**2
     mine = alike(here.loop) if joint < 0 else np.arange(len(each)) == joint
-    count = np.asarray(here.data.share).sum() / here.loop.robot.nv * mine.sum()
+    count = counted(here.data) / here.loop.robot.nv * mine.sum()
     return float(np.sqrt(each[mine].sum() / max(count, 1)))

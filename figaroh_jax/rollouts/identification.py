@@ -21,7 +21,7 @@ from .fit import Fit, System, fit, standard_errors
 from .loop import Loop
 from .own import is_own
 from .parameters import BOUNDS, OF_DRIVES, TEN, TILT, put, unit_of
-from .setting import Setting, Structure, begun, coloured, level_of, rms_of_rows
+from .setting import Setting, Structure, begun, by_readings, coloured, level_of, residuals
 from .task import (
     all_slide,
     colour_notes,
@@ -84,7 +84,7 @@ def identify_rollout_task(
             raise InputError(f"{task.robot.model}: {diverged(here, first)}")
         here, first = told_alone(here, first)
         here, first, more = fitted_with_both(here, first)
-        here, first = _by_colour(here, first)
+        here, first = _by_readings(*_by_colour(here, first))
         first, links = consistent(here, first)
         final = put(here.loop, here.known.table, first.theta)
         rows = judged_rows(here)
@@ -105,6 +105,16 @@ def identify_rollout_task(
     joints = tuple(loop.robot.dof_names[k] for k in loop.measured)
     units = tuple("m" if name in straight else "rad" for name in joints)
     return RolloutIdentification(result, final, extended_of(final), predictions, joints, units, traces)
+
+
+def _by_readings(here: Setting, first: Fit) -> tuple[Setting, Fit]:
+    """The fit once more where a counter that stands tells one reading."""
+    again = by_readings(here, first)
+    if again is None:
+        return here, first
+    structure = Structure(again.loop, again.known.table, again.data)
+    one = fit(*structure, first.theta[None], [again.baseline], first.start[None], width=again.width, lanes=1)[0]
+    return (again, one) if np.isfinite(one.cost) else (here, first)
 
 
 def _by_colour(here: Setting, first: Fit) -> tuple[Setting, Fit]:
@@ -133,8 +143,10 @@ def _result(
     here: Setting, first: Fit, held: dict[str, tuple[Run, np.ndarray]], notes: tuple[str, ...]
 ) -> dict[str, Any]:
     structure = Structure(here.loop, here.known.table, here.data)
-    rms = rms_of_rows(structure, first)[: len(here.noise[0])] * here.noise[0]
-    level = max(1.0, level_of(first, np.asarray(here.data.share)))
+    weight = np.asarray(here.data.weight)[:, : len(here.noise[0])]
+    error = residuals(structure, first)[:, : len(here.noise[0])] / np.where(weight > 0, weight, 1.0)
+    rms = np.sqrt((error**2).sum((0, 2)) / np.maximum((weight > 0).sum((0, 2)), 1))
+    level = max(1.0, level_of(first, here.data))
     covariance = System(first.sums, here.data, first.start).covariance(first.free < 0)
     size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     free = [k for k in range(len(first.free)) if first.free[k] >= 0]

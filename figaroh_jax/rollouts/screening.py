@@ -255,10 +255,10 @@ def _only(data: Windows, which: np.ndarray) -> Windows:
     return jax.tree.map(lambda x: np.asarray(x)[..., which], data)
 
 
-def _rows(here: Setting, joint: int) -> float:
-    """Readings of a joint."""
+def _rows(here: Setting, joint: int) -> int:
+    """Samples of a joint that count."""
     column = here.loop.measured.index(joint)
-    return float(np.asarray(here.data.share)[:, column :: len(here.loop.measured)].sum())
+    return int((np.asarray(here.data.weight)[:, column :: len(here.loop.measured)] > 0).sum())
 
 
 def _asked_by(one: Candidate, others: Sequence[_Ranked]) -> bool:

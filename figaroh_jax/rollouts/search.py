@@ -22,8 +22,10 @@ from .setting import (
     bare,
     begins_of,
     begun,
+    by_readings,
     by_recording,
     coloured,
+    counted,
     excess,
     far_off,
     free_entries,
@@ -168,6 +170,8 @@ def search(
 ) -> Search:
     """Baseline, then one cause after another while held-out data gain; what is left decides the verdict."""
     found = _by_parts(here, _searched(here, progress, forbid, begin), progress, forbid)
+    if (again := by_readings(found.setting or here, found.last)) is not None:
+        found = _searched(again, progress, forbid)
     return judged_by_colour(here, found, lambda again: _searched(again, lambda phase, share: None, forbid))
 
 
@@ -188,7 +192,7 @@ def _by_parts(here: Setting, found: Search, progress: Callable[[str, float], Non
     held = [found.held[0], _rms(here, held_out(last, here.folds))]
     named = [one._replace(before=held[0], after=held[1]) for one in short.named]
     label = ", ".join(str(Name(one.candidate.effect, one.candidate.at)) for one in named)
-    levels = [found.table[0], (label, level_of(last, np.asarray(structure.data.share)))]
+    levels = [found.table[0], (label, level_of(last, structure.data))]
     more = {"first": found.first, "last": last, "p_value": found.p_value, "origin": found.origin, "fits": [last]}
     return replace(short, structure=structure, named=named, table=levels, held=held, setting=None, **more)
 
@@ -201,7 +205,7 @@ def _searched(
     first = begun(here) if begin is None else begin
     share = np.asarray(here.data.share)
     now = Model(structure, first, here.baseline, excess(whitened(structure, first), share))
-    stood, found, p_value, steps, nearest = [now], [], 1.0, [("baseline", level_of(first, share))], []
+    stood, found, p_value, steps, nearest = [now], [], 1.0, [("baseline", level_of(first, here.data))], []
     most = _MOST if by_recording(here) else _MOST_ONE
     while len(found) < most:
         progress(f"searching for cause {len(found) + 1}", min(0.2 + 0.15 * len(found), 0.9))
@@ -215,18 +219,18 @@ def _searched(
         found.append(best[0])
         now = best[1]
         stood.append(now)
-        steps.append((str(Name(best[0].candidate.effect, best[0].candidate.at)), level_of(now.fit, share)))
+        steps.append((str(Name(best[0].candidate.effect, best[0].candidate.at)), level_of(now.fit, here.data)))
         if now.excess < 1.0:
             break
     if found and now.excess < 1.0 and (alone := bare(here, now.fit)) is not None:
-        first, found, p_value, steps = alone, [], 1.0, [("baseline", level_of(alone, share))]
+        first, found, p_value, steps = alone, [], 1.0, [("baseline", level_of(alone, here.data))]
         now = Model(structure, first, here.baseline, excess(whitened(structure, first), share))
         stood = [now]
     held = [_rms(here, held_out(first, here.folds)), *(n.after for n in found)]
     found, now, doubtful = _of_sure_size(here, now, found, forbid)
     for one, model in doubtful:
         stood.append(model)
-        steps.append((f"without {one[0]}", level_of(model.fit, share)))
+        steps.append((f"without {one[0]}", level_of(model.fit, here.data)))
         held.append(_rms(here, _held_out(here, model, [])[1]))
     result = _judged(here, stood[0], now, found, p_value, steps, nearest)
     result.held, result.doubtful, result.spread = held, [one for one, _ in doubtful], _spread(here, now)
@@ -587,8 +591,7 @@ def _without_folds(here: Setting, now: Model, held: np.ndarray) -> np.ndarray:
 
 def _rms(here: Setting, squares: np.ndarray) -> float:
     """Whitened squares as an RMS of position: rad, or m."""
-    count = np.asarray(here.data.share).sum()
-    return float(np.sqrt(max(squares.sum(), 0.0) / count * np.mean(here.spread**2)))
+    return float(np.sqrt(max(squares.sum(), 0.0) / counted(here.data) * np.mean(here.spread**2)))
 
 
 def sized(here: Setting, one: Tried) -> bool:

@@ -38,7 +38,7 @@ class Windows(eqx.Module):
 
     command: Any  # (lead + rows, nu, windows), rad; `lead` rows of history
     reading: Any  # (rows, ny, windows): positions of the encoders, then their rates where these were recorded
-    weight: Any  # (rows, ny, windows): 1 / standard deviation x sqrt(share), 0 where nothing counts
+    weight: Any  # (rows, ny, windows): 1 / standard deviation, 0 where nothing counts
     start: Any  # (2 nv, windows): position and velocity at the first row, as measured
     precision: Any  # (2 nv, windows): 1 / standard deviation of that state
     carried: Any  # (rows, 4 + 3 links, windows): what one joint carries (`alone.carried_by`), or None
@@ -46,7 +46,8 @@ class Windows(eqx.Module):
     lead: int = eqx.field(static=True)
     block: int = eqx.field(static=True)  # rows that one sum covers; divides the rows
     pole: Any = None  # (ny, windows) of noise that is a first-order low pass of white noise; None: it is white
-    share: Any = None  # (rows, ny, windows): how much of a reading a row tells (`data.told_by`), 0 where nothing counts
+    weighed: bool = eqx.field(static=True, default=False)  # whether the weights hold the roots of the shares
+    share: Any = None  # (rows, ny, windows): how much of a reading a row tells (`data.told_by`), 0 if nothing
 
 
 class Sums(NamedTuple):

@@ -30,8 +30,10 @@ __all__ = [
     "begins_of",
     "begun",
     "begun_by_parts",
+    "by_readings",
     "by_recording",
     "coloured",
+    "counted",
     "evened",
     "excess",
     "far_off",
@@ -40,7 +42,6 @@ __all__ = [
     "largest_forces",
     "level_of",
     "residuals",
-    "rms_of_rows",
     "setting",
     "start_values",
     "thinned",
@@ -52,7 +53,7 @@ _ROUGH = 1e-3  # share of the squares that a step of such a start must promise
 _ENOUGH = 6000  # rows of an arm's recordings that a search is made on; the more are asked at the end
 _SHORTEST = 100  # rows of a window that is shortened for that
 _EARLY = 4  # iterations of a race among all starts
-_OFF, _FAR_OFF = 1.3, 9.0  # times the noise's power, from which a baseline, and a search, is begun by short windows too
+_NOISE, _FAR_OFF = 1.3, 9.0  # times the noise's power: up to it noise is left; from it on short windows are tried too
 _PART, _LEAST, _ENDS = 0.5, 20, 15  # s and least rows of such a window; iterations of their fit
 
 
@@ -72,6 +73,7 @@ class Setting:
     stretches: tuple[Stretch, ...]
     block: float
     pole: np.ndarray | None = None  # of coloured noise, of which `noise` drives the low pass
+    readings: bool = False  # whether rows weigh by what they tell of a reading: `by_readings`
     even: np.ndarray | None = None  # (runs, ny) by which rows weigh more or less than by their noise: `evened`
 
     @property
@@ -83,6 +85,8 @@ class Setting:
     def cut(self, loop: Loop) -> Windows:
         """The recordings in windows, for a loop of these joints."""
         data = windows(loop, self.runs, self.stretches, self.noise, self.block, pole=self.pole)
+        if self.readings:
+            data = replace(data, weight=np.asarray(data.weight) * np.sqrt(data.share), weighed=True)
         if self.even is None:
             return data
         share = self.even[[one.run for one in self.stretches]].T
@@ -197,14 +201,14 @@ def evened(here: Setting, structure: Structure, found: Fit) -> Setting:
     """
     plain = here.plain()
     data = structure._replace(data=plain.cut(structure.loop))
-    left, counted = residuals(data, found), np.asarray(data.data.share)
+    left, told = residuals(data, found), np.asarray(data.data.weight) > 0
     run = np.array([one.run for one in here.stretches])
     size = np.ones((run.max() + 1, left.shape[1]))
     for k in np.unique(run):
-        count = counted[..., run == k].sum((0, 2))
+        count = told[..., run == k].sum((0, 2))
         size[k] = np.sqrt((left[..., run == k] ** 2).sum((0, 2)) / np.maximum(count, 1))
     size = np.maximum(size, 1.0)
-    mean = np.sqrt((left**2).sum() / max(counted.sum(), 1))
+    mean = np.sqrt((left**2).sum() / max(told.sum(), 1))
     some = replace(plain, even=mean / size)
     return replace(some, data=some.cut(here.loop))
 
@@ -238,17 +242,15 @@ def residuals(structure: Structure, found: Fit) -> np.ndarray:
     return (np.asarray(structure.data.reading) - np.asarray(read)) * np.asarray(structure.data.weight)
 
 
-def rms_of_rows(structure: Structure, found: Fit) -> np.ndarray:
-    """RMS over all rows of what a fit leaves of each position, over its noise, (ny,)."""
-    share = np.asarray(structure.data.share)
-    left = residuals(structure, found) / np.sqrt(np.where(share > 0, share, 1.0))
-    return np.sqrt((left**2).sum((0, 2)) / np.maximum((share > 0).sum((0, 2)), 1))
-
-
 def whitened(structure: Structure, found: Fit) -> np.ndarray:
-    """What each row's residual tells beyond the row before it, (rows, ny, windows): white where it is noise."""
+    """What each row's residual tells beyond the row before it, (rows, ny, windows): white where it is noise.
+
+    By what the row tells of a reading (`Windows.share`).
+    """
     pole = None if structure.data.pole is None else np.asarray(structure.data.pole)
-    return filtered(residuals(structure, found), np.asarray(structure.data.weight) > 0, pole)
+    left = residuals(structure, found)
+    left = left if structure.data.weighed else left * np.sqrt(np.asarray(structure.data.share))
+    return filtered(left, np.asarray(structure.data.weight) > 0, pole)
 
 
 def coloured(here: Setting, structure: Structure, found: Fit) -> Setting | None:
@@ -284,9 +286,26 @@ def excess(error: np.ndarray, share: np.ndarray) -> float:
     return float(max(power / POWER, slow / SLOW))
 
 
-def level_of(found: Fit, share: np.ndarray) -> float:
-    """Mean square of the misfit over the readings, in units of the noise's variance."""
-    return found.squares / max(share.sum(), 1)
+def level_of(found: Fit, data: Windows) -> float:
+    """Mean square of the misfit over the samples that count, in units of the noise's variance."""
+    return found.squares / max(counted(data), 1)
+
+
+def counted(data: Windows) -> float:
+    """Samples that count, or readings where rows weigh by what they tell of one."""
+    return float(np.asarray(data.share).sum() if data.weighed else (np.asarray(data.weight) > 0).sum())
+
+
+def by_readings(here: Setting, last: Fit) -> Setting | None:
+    """The setting in which a counter that stands tells one reading, where a fit leaves noise alone; else None.
+
+    All rows of a stand have one error of reading. A model's own error, where that is more, each of them tells.
+    """
+    stands = (np.asarray(here.data.share) < (np.asarray(here.data.weight) > 0)).any()
+    if here.readings or here.pole is not None or not stands or not level_of(last, here.data) < _NOISE:
+        return None
+    again = replace(here, readings=True)
+    return replace(again, data=again.cut(here.loop))
 
 
 def by_recording(here: Setting) -> bool:
@@ -314,12 +333,13 @@ def _begun(here: Setting) -> Fit:
 
 
 def begun_by_parts(here: Setting, found: Fit) -> Fit:
-    """A baseline's fit; where it leaves more than noise, the better one of it and of one begun by short windows.
+    """A baseline's fit; where it leaves much more than noise, the better one of it and of one begun by short windows.
 
     A long simulation that a drive's limit, or friction, holds up leads to numbers that no step leaves again; from the
-    measured states at the starts of many short ones it does not.
+    measured states at the starts of many short ones it does not. Not where it has several starts: real arms with free
+    gains that a baseline explains better so were explained worse with all causes.
     """
-    if not np.isfinite(found.cost) or level_of(found, np.asarray(here.data.share)) < _OFF:
+    if not np.isfinite(found.cost) or not far_off(here, found) or len(begins_of(here, found.theta)) > 1:
         return found
     some = in_parts(here)
     if len(some.stretches) == len(here.stretches):
@@ -360,7 +380,7 @@ def in_parts(here: Setting) -> Setting:
 
 def far_off(here: Setting, found: Fit) -> bool:
     """Whether a fit leaves much more than noise."""
-    return level_of(found, np.asarray(here.data.share)) > _FAR_OFF
+    return level_of(found, here.data) > _FAR_OFF
 
 
 def begins_of(here: Setting, theta: np.ndarray) -> np.ndarray:

@@ -118,7 +118,7 @@ def simpler(
 
 
 def _level(structure: Structure, last: Fit) -> float:
-    return max(1.0, last.squares / np.asarray(structure.data.share).sum())
+    return max(1.0, last.squares / (np.asarray(structure.data.weight) > 0).sum())
 
 
 def _size(c: Candidate) -> tuple[int, ...]:

@@ -34,7 +34,7 @@ from .reading import load_loop
 from .rest import nearest_of, parts_of, relative_rest
 from .search import Named, Search, search
 from .sensitivity import predicted
-from .setting import Setting, Structure, begun, rms_of_rows, setting
+from .setting import Setting, Structure, begun, residuals, setting
 from .sizes import is_excepted, is_open, possible, told_errors
 from .thresholds import REFITTED
 
@@ -389,7 +389,9 @@ def judged_note(here: Setting) -> tuple[str, ...]:
 
 
 def _rms(structure: Structure, fitted: Any, scale: np.ndarray) -> np.ndarray:
-    return rms_of_rows(structure, fitted)[: len(scale)] * scale
+    weight = np.asarray(structure.data.weight)[:, : len(scale)]
+    error = residuals(structure, fitted)[:, : len(scale)] / np.where(weight > 0, weight, 1.0)
+    return np.sqrt((error**2).sum((0, 2)) / (weight > 0).sum((0, 2)))
 
 
 def colour_notes(here: Setting) -> tuple[str, ...]:
