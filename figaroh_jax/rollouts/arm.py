@@ -60,7 +60,9 @@ def search_arm(
     """Causes of an arm whose drives act at one joint each and whose joints are all measured."""
     found = _by_parts(here, _searched(here, progress, forbid), progress, forbid)
     if (again := by_readings(found.setting or here, found.last)) is not None:
+        told = found.faults
         found = _searched(again, progress, forbid)
+        found.faults = [*told, *found.faults]
     return judged_by_colour(here, found, lambda again: _by_colour(again, found, forbid))
 
 

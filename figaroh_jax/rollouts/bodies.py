@@ -71,11 +71,11 @@ def searched_with_bodies(
     `link_inertia` is named at every link that recordings left out bear out, before all other causes. So it is in place
     of a payload and more, where it leaves noise alone with fewer causes: a load is seldom at the link's centre of mass.
     """
-    progress("asking whether links are as heavy as the file says", 0.9)
     if (fewer := _in_place_of_a_load(seek, here, found, progress, forbid)) is not None:
         return fewer
     if not _is_asked(here, found, forbid):
         return found
+    progress("asking whether links are as heavy as the file says", 0.9)
     before = found.setting or here
     plain = _rigid(here, found)
     sound = replace(before, loop=plain.structure.loop)
