@@ -188,12 +188,13 @@ def _places(effect: type[Effect], model: RobotModel) -> np.ndarray:
         return np.arange(len(model.joints))[:, None]
     if effect.acts_on == "robot":
         return np.zeros((1, 0), dtype=int)
-    neighbours = {
-        tuple(sorted((model.joints[joint.parent].coordinate, joint.coordinate)))
+    rank = {joint.coordinate: k for k, joint in enumerate(model.joints) if not joint.follows}
+    neighbours = {  # in the order of the tree, whatever the columns'
+        tuple(sorted((model.joints[joint.parent].coordinate, joint.coordinate), key=rank.__getitem__))
         for joint in model.joints
         if joint.parent >= 0 and model.joints[joint.parent].coordinate != joint.coordinate
     }
-    return np.array(sorted(neighbours), dtype=int).reshape(-1, 2)
+    return np.array(sorted(neighbours, key=sorted), dtype=int).reshape(-1, 2)
 
 
 def local(effect: Effect) -> bool:

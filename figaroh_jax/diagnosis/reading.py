@@ -19,7 +19,7 @@ from jaxtyping import Float
 from ..formats.recording_keys import Preprocess
 from ..recordings.bandwidth import encoder_step
 from ..recordings.dataset import Recording
-from ..recordings.resampling import unrounded
+from ..recordings.resampling import read_clock
 from ..recordings.signals import Signals, prepare_all
 from ..recordings.stacked import stack
 from .holdout import predicted
@@ -131,7 +131,7 @@ def _read(
     """The recording with the prepared motion, read by its encoders once more, and a torque along it."""
     from scipy.interpolate import CubicSpline  # scipy is slow to import
 
-    at = np.clip(unrounded(recording.time), signals.time[0], signals.time[-1])
+    at = np.clip(read_clock(recording.time, recording.position), signals.time[0], signals.time[-1])
     true, read = CubicSpline(signals.time, signals.position)(at), np.array(recording.position)
     for joint, own in enumerate(true.T):
         step, place = encoder_step(read[:, joint]), generator.random()

@@ -102,9 +102,12 @@ def stands(problem: Problem) -> Bool[np.ndarray, " nv"]:
 
     A joint that turns at constant acceleration is an eighth of its slow rows within an eighth of the band.
     """
-    speed, judged = relative_speed(problem), np.asarray(problem.records.judged) > 0
-    slow = ((speed < STANDSTILL) & judged).sum((0, 1))
-    return ((speed < STANDSTILL * PASSED) & judged).sum((0, 1)) > 2 * PASSED * slow
+    speed = relative_speed(problem)
+    there = np.zeros((*speed.shape[:2], 1), bool)  # rows at which a joint stands are not judged, and count here
+    for at in problem.records.spans:
+        there[at.slot, at.row : at.row + at.rows] = True
+    slow = ((speed < STANDSTILL) & there).sum((0, 1))
+    return ((speed < STANDSTILL * PASSED) & there).sum((0, 1)) > 2 * PASSED * slow
 
 
 def beyond_sliding(problem: Problem, state: State, left: Float[np.ndarray, "n M nv"]) -> Float[np.ndarray, "n M nv"]:

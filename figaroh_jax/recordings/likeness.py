@@ -32,6 +32,8 @@ ROWS = 400  # evenly spread over the recording: more do not change a correlation
 CUTOFF = 5.0  # Hz, the band in which gravity and inertia stand above noise
 LINKS_OFF = 0.3  # of the inertial torque of a joint: what nominal links may be off
 FEWEST_JOINTS = 1.5  # that must tell of the clock, each counted by its weight
+STANDS = 0.02  # of a joint's top speed
+ENOUGH_MOVING = 60  # rows in which a joint moves, of at most `ROWS`
 FEWEST = 16  # samples that a filter and five columns need
 
 
@@ -205,7 +207,13 @@ def likeness(
     velocity: Float[np.ndarray, " rows"],
     acceleration: Float[np.ndarray, " rows"],
 ) -> Likeness:
-    """One measured torque against one nominal torque, beside the friction and the rotor of one joint."""
+    """One measured torque against one nominal torque, beside the friction and the rotor of one joint.
+
+    Rows at which the joint stands are left out where enough others are there: dry friction holds any torque then.
+    """
+    moves = np.abs(velocity) > STANDS * np.abs(velocity).max()
+    if ENOUGH_MOVING <= moves.sum() < len(velocity):
+        nominal, torque, velocity, acceleration = (x[moves] for x in (nominal, torque, velocity, acceleration))
     speed = np.sqrt(np.mean(velocity**2)) or 1.0
     others = np.column_stack([np.ones(len(torque)), velocity, np.tanh(velocity / (0.1 * speed)), acceleration])
     basis = _basis(others)

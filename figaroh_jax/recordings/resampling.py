@@ -10,13 +10,14 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 __all__ = [
     "Grid",
     "band_limited",
     "differentiate",
     "even_grid",
+    "read_clock",
     "sampling_rate",
     "stencil",
     "to_recording_times",
@@ -29,6 +30,7 @@ STAMP = 1e-7  # s: stamps are not told apart below it
 FEW_STAMPS = 20  # from which rounding is told from chance
 ON_LATTICE = 0.01  # of the lattice of stamps: where they stand on it
 ROUNDED = 0.75  # of the lattice: how far from it the clock may be (half, and what the line's own fit is off)
+SMOOTHER = 0.8  # times the mean square about cubics, on an even clock: its motion is the smoother one
 _SAME = 9  # decimals, in samples: instants that lie so close between samples have one kernel
 _AT_ONCE = 1 << 22  # weights of an interpolation that are held at once
 STOP_BAND = 100.0  # dB
@@ -69,11 +71,58 @@ def unrounded(time: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " sample
     if np.abs(ticks - np.rint(ticks)).max() > ON_LATTICE:
         return time
     for step in (np.median(steps), steps.mean()):
-        count = np.append(0.0, np.cumsum(np.maximum(np.rint(steps / step), 1)))
-        period, start = np.polyfit(count, time, 1)
-        if np.abs(time - (start + period * count)).max() < ROUNDED * lattice:
-            return start + period * count
+        even, _ = _even_clock(time, float(step))
+        if np.abs(time - even).max() < ROUNDED * lattice:
+            return even
     return time
+
+
+def _even_clock(time: Float[np.ndarray, " samples"], step: float) -> tuple[np.ndarray, np.ndarray]:
+    """The even clock nearest to the stamps, and how many steps of it lie before each; samples may be missing."""
+    count = np.append(0.0, np.cumsum(np.maximum(np.rint(np.diff(time) / step), 1)))
+    period, start = np.polyfit(count, time, 1)
+    return start + period * count, count
+
+
+def read_clock(
+    time: Float[np.ndarray, " samples"], position: Float[np.ndarray, "samples nq"]
+) -> Float[np.ndarray, " samples"]:
+    """When the samples were taken (s): the stamps, or the even clock behind stamps that are rounded or shake.
+
+    A driver that reads its sensors evenly may stamp them when it gets round to it: such stamps shake the position by
+    its velocity times their error. They count as shaken where none is half a period off one even clock, and the motion
+    is smoother on that clock: its samples lie nearer to the cubic through the two before and the two after each.
+    """
+    time = unrounded(time)
+    steps = np.diff(time)
+    if len(time) < FEW_STAMPS or _is_even(time) or not (steps > 0).all():
+        return time
+    even, count = _even_clock(time, float(np.median(steps)))
+    if np.abs(time - even).max() > 0.5 * (even[-1] - even[0]) / max(count[-1], 1.0):
+        return time
+    beside = np.flatnonzero(count[4:] - count[:-4] == 4)  # no sample lacks among five
+    if len(beside) < FEW_STAMPS:
+        return time
+    stamped, steady = (_roughness(clock, position, beside) for clock in (time, even))
+    moves = np.ptp(position, axis=0) > 0
+    if not moves.any():
+        return time
+    least = np.finfo(float).tiny
+    gained = np.log((steady[moves] + least) / (stamped[moves] + least)).mean()
+    return even if gained < np.log(SMOOTHER) else time
+
+
+def _roughness(
+    time: Float[np.ndarray, " samples"], x: Float[np.ndarray, "samples cols"], first: Int[np.ndarray, " fives"]
+) -> Float[np.ndarray, " cols"]:
+    """Mean square of what the middle one of five samples is off the cubic through the other four."""
+    at = time[first[:, None] + np.array([0, 1, 3, 4])] - time[first + 2][:, None]
+    off = x[first + 2].copy()
+    for one in range(4):
+        others = [k for k in range(4) if k != one]
+        weight = np.prod(-at[:, others] / (at[:, [one]] - at[:, others]), axis=1)
+        off -= weight[:, None] * x[first + (0, 1, 3, 4)[one]]
+    return (off**2).mean(axis=0)
 
 
 def _is_even(time: Float[np.ndarray, " samples"]) -> bool:

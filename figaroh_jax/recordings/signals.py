@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
@@ -24,7 +24,16 @@ from .bandwidth import encoder_step, motion_band, smoothed
 from .cleaning import near, without_untrusted
 from .dataset import Recording
 from .groupmotion import continued, group_rates, normalised
-from .resampling import Grid, band_limited, differentiate, even_grid, sampling_rate, to_recording_times, unrounded
+from .resampling import (
+    Grid,
+    band_limited,
+    differentiate,
+    even_grid,
+    read_clock,
+    sampling_rate,
+    to_recording_times,
+    unrounded,
+)
 from .rowfilter import RowFilter, fast_length, filter_rows, frequencies, low_pass, row_filter
 
 if TYPE_CHECKING:
@@ -61,6 +70,9 @@ FEWEST_ROWS = 10
 STALE = 0.1  # of the samples: more that repeat the one before are those of a robot that stands
 MOST_STALE = 3  # of them in a row
 STILL = 1e-12  # of rad or m: what a joint that stands still moves by rounding
+CARRIES = 0.5  # periods of the cutoff to which the row filter carries what happens at a joint's rest
+STANDS = 0.01  # of a joint's top speed
+MOSTLY_STANDS = 0.9  # of a joint's rows
 HALF_OCTAVE = 2**-0.5
 WORTH_A_STEP = 0.1  # fall of the squares that a model leaves of the torque (mean logarithm) for half an octave less
 AT_COST = 1 / 3  # of that fall: what the squares of no joint may rise by
@@ -131,7 +143,37 @@ def prepare_all(
             more = {"band": band, "model": model, "resampled": resampled}
             signals = prepare(recording, preprocess, rates, shift=off, **more)
         prepared.append(signals)
-    return tuple(prepared)
+    return without_standing(prepared)
+
+
+def without_standing(prepared: Sequence[Signals]) -> tuple[Signals, ...]:
+    """The recordings without the rows of a joint that stands, and without those to which the filter carries them.
+
+    A joint stands where its speed stays below a hundredth of its largest in all recordings for two periods of the
+    cutoff. Dry friction holds it there with any torque up to its limit, and a brake with any at all: no law predicts
+    the torque of its drive. A joint on its way through zero is not meant, nor one that hardly ever moves.
+    """
+    top = np.max([np.abs(one.velocity).max(axis=0) for one in prepared], axis=0)
+    stands = [_standing(one, STANDS * top) for one in prepared]
+    lost = sum(((one.rows.weight > 0) & out).sum(0) for one, out in zip(prepared, stands, strict=True))
+    there = sum((one.rows.weight > 0).sum(0) for one in prepared)
+    moves = lost <= MOSTLY_STANDS * there
+    return tuple(
+        replace(one, rows=eqx.tree_at(lambda r: r.weight, one.rows, np.where(out & moves, 0.0, one.rows.weight)))
+        for one, out in zip(prepared, stands, strict=True)
+    )
+
+
+def _standing(one: Signals, slow: Float[np.ndarray, " nv"]) -> Bool[np.ndarray, "rows nv"]:
+    """Rows at which each joint stands, and as near to them as half a period of the cutoff."""
+    reach, least = (max(1, round(periods / one.cutoff / one.dt)) for periods in (CARRIES, 2.0))
+    out = np.zeros((len(one.velocity), len(slow)), bool)
+    for joint, still in enumerate((np.abs(one.velocity) < slow).T):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
+        for begin, end in zip(edges[::2], edges[1::2], strict=True):
+            if end - begin >= least:
+                out[max(0, begin - reach) : end + reach, joint] = True
+    return out[np.asarray(one.rows.index)]
 
 
 def prepare(
@@ -200,7 +242,7 @@ def prepare(
         bands=bands,
         rows=eqx.tree_at(lambda r: r.weight, rows, weight),
         load=recording.load,
-        notes=recording.notes + _gap_notes(recording, gaps, rates.cutoff),
+        notes=recording.notes + _clock_notes(recording) + _gap_notes(recording, gaps, rates.cutoff),
     )
 
 
@@ -306,7 +348,9 @@ def choose_rates(recordings: Sequence[Recording], preprocess: Preprocess) -> Rat
     times the cutoff, because differences and friction signs need the finer samples, and is 13.2 times the cutoff for
     long data that it would else sample more than 16 times as fast.
     """
-    raw, file = min((sampling_rate(unrounded(recording.time)), str(recording.file)) for recording in recordings)
+    raw, file = min(
+        (sampling_rate(read_clock(recording.time, recording.position)), str(recording.file)) for recording in recordings
+    )
     cutoff = preprocess.cutoff or min(DEFAULT_CUTOFF, 0.2 * raw)
     if cutoff >= raw / 2:
         raise InputError(
@@ -328,7 +372,8 @@ def choose_rates(recordings: Sequence[Recording], preprocess: Preprocess) -> Rat
 
 def _window(recording: Recording, window: tuple[float, float] | None):
     """The part of a recording that is kept."""
-    time, position, torque = unrounded(recording.time), recording.position, recording.torque
+    time = read_clock(recording.time, recording.position)
+    position, torque = recording.position, recording.torque
     if torque is not None:
         new = _new_samples(position, torque)
         time, position, torque = time[new], position[new], torque[new]
@@ -388,6 +433,17 @@ def _weight(recording: Recording, preprocess: Preprocess, rows: RowFilter, veloc
 def _long(gaps, cutoff: float) -> list[tuple[float, float]]:
     """Gaps that hide a quarter of the fastest period that passes."""
     return [(begin, end) for begin, end in gaps if end - begin > 0.25 / cutoff]
+
+
+def _clock_notes(recording: Recording) -> tuple[str, ...]:
+    clock, stamps = read_clock(recording.time, recording.position), unrounded(recording.time)
+    off = float(np.std(clock - stamps))
+    if off == 0:
+        return ()
+    return (
+        f"{recording.name}: its time stamps shake by {1e3 * off:.2g} ms (RMS) about an even clock on which the motion"
+        " is smoother: that clock is used",
+    )
 
 
 def _gap_notes(recording: Recording, gaps, cutoff: float) -> tuple[str, ...]:
