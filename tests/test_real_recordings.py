@@ -83,7 +83,8 @@ def test_every_cause_that_the_search_found_is_named_or_told_with_the_reason_why_
     task = load_task(blackbox.write_task(cases, run, twin_of(cases, REAL["dfki_double_pendulum"]())))
     answer = diagnose_task(task)
     told = {cause.name for cause in answer.causes} | {near.name for near in answer.rest.nearest}
-    assert found_by[-1].found and {one.name for one in found_by[-1].found} <= told
+    # of the searches after the first the one that is answered with: another may have been tried and lost
+    assert any(search.found and {one.name for one in search.found} <= told for search in found_by[1:])
     like_a_rest = {one.name for search in found_by for one in search.found if one.effect.name == "presliding"}
     assert like_a_rest and like_a_rest <= told  # the search had been taken up again without it, and it was not told
     assert all(near.why_not for near in answer.rest.nearest)

@@ -79,7 +79,7 @@ def _as_rows_count(here: Setting, joint: Joint, named: list[Found]) -> tuple[Set
     """The fit in which rows count beside what is believed of the links as parts left out ask for.
 
     Whitened rows count as independent ones. What a model leaves goes on from one to the next, so that many say what one
-    does, and the links follow it further than they are believed to move.
+    does, and the links follow it further than they are believed to move. Recordings kept out have the last word.
     """
     error, best = part_error(here.problem, joint.step), here
     for times in FEWER:
@@ -89,7 +89,14 @@ def _as_rows_count(here: Setting, joint: Joint, named: list[Found]) -> tuple[Set
         if own >= error:
             break
         error, best = own, one
-    return (here, joint) if best is here else (best, together(best, named))
+    if best is here:
+        return here, joint
+    other = together(best, named)
+    if here.problem.held.any():
+        fewer, all_of = (kept_squares(one.problem, fit.step) for one, fit in ((best, other), (here, joint)))
+        if surely_less(fewer, all_of):
+            return here, joint
+    return best, other
 
 
 def _weights(problem: Problem) -> list[Float[np.ndarray, "n M nv"]]:
