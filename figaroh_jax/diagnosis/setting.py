@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -23,7 +24,7 @@ from .problem import Problem
 from .state import State, baseline, stated_effects, with_width
 from .step import stand, with_causes
 from .thresholds import MOST_OF_RESIDUAL, OF_ANOTHER_WIDTH, PASSED_FOR_NOISE, WEIGHT_ROUNDS
-from .weights import weighted_by_speed, white_where_better, without_reversals
+from .weights import weighted_by_speed, white_where_better, without_held, without_reversals
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess
@@ -97,7 +98,8 @@ def _baseline_squares(problem: Problem, start: State) -> Float[np.ndarray, " nv"
 
 def _begun(backend: Backend, signals: Sequence[Signals], known: Baseline | None, trust: float) -> tuple[Problem, State]:
     """The recordings on one clock, and the baseline."""
-    records = without_reversals(stack(signals, backend.robot, joined=True))
+    records = stack(signals, backend.robot, joined=True)
+    records = without_reversals(eqx.tree_at(lambda r: r.weight, records, records.weight + records.standing))
     held = held_rows(signals, records)
     problem = Problem(backend, records, layout(signals, records), trust, np.zeros(backend.robot.nv), held)
     return problem, baseline(problem, *stated_effects(backend.robot, known))
@@ -108,6 +110,7 @@ def setting_of(
 ) -> Setting:
     """The recordings on one clock, the baseline, and the noise; holdout recordings stand behind the others."""
     progress("estimating the noise", 0.08)
+    problem = without_held(problem, start)
     spectrum, whitening = noise_floor(problem, start, forbid)
     problem = friction_width(problem, start, whitening)
     start = with_width(problem, start)

@@ -16,7 +16,7 @@ from ..recordings.stacked import Records, filter_rows
 from .flexible import smooth_functions
 from .holdout import fold_error, weighted_rms
 from .problem import Problem
-from .state import State, whitened
+from .state import State, plain_rows, whitened
 from .step import stand
 from .thresholds import (
     FAST,
@@ -29,8 +29,16 @@ from .thresholds import (
     WHITE_GAIN,
 )
 
-__all__ = ["relative_speed", "speed_factors", "weighted_by_speed", "white_where_better", "without_reversals"]
+__all__ = [
+    "relative_speed",
+    "speed_factors",
+    "weighted_by_speed",
+    "white_where_better",
+    "without_held",
+    "without_reversals",
+]
 
+HELD = 2.0  # times what a rich model leaves in motion: what it leaves at rest is dry friction
 RIDGE = 1e-6  # of the mean diagonal of a joint's normal equations
 
 
@@ -81,6 +89,33 @@ def speed_factors(problem: Problem, state: State, whitening: Float[np.ndarray, "
     return np.array(out)
 
 
+def without_held(problem: Problem, state: State) -> Problem:
+    """The problem without the rows at which a joint stands, where its motion says clearly that they are no model's.
+
+    Dry friction holds a joint with any torque up to its limit. What a rich model that is fitted to the joint's motion
+    leaves of the rows at rest says how much of that there is: where its squares are several times those that it leaves
+    in motion, row by row and in all, they tell nothing of the robot, and a cause that explains them stands for
+    friction. Where they are not, the rows are weighted by their speed as others are.
+    """
+    records = problem.records
+    standing = np.asarray(records.standing) * records.fitted
+    if not standing.any():
+        return problem
+    rows, functions = plain_rows(problem, state), smooth_functions(state.motion)
+    ones, weight = np.ones((len(records.omega), len(rows.y))), np.asarray(records.weight).copy()
+    for joint in range(len(rows.y)):
+        still = standing[..., joint].reshape(-1) > 0
+        moves = (np.asarray(records.judged)[..., joint] * records.fitted[..., joint]).reshape(-1) > 0
+        if not still.any() or moves.sum() < ROWS_OF_A_BIN:
+            continue
+        smooth = _whitened_rows(problem, state, functions[joint], ones, joint)
+        left = _left(rows, state, joint, smooth, moves)
+        at_rest, moving = left[still] ** 2, left[moves] ** 2
+        if min(at_rest.mean() / moving.mean(), at_rest.sum() / moving.sum()) > HELD**2:
+            weight[..., joint] *= 1 - standing[..., joint]
+    return problem.weighted(weight)
+
+
 def _friction_of_low_speed(problem: Problem, state: State, joint: int) -> Float[np.ndarray, "k nN"]:
     """Friction that falls, or rises, within some share of the joint's top speed: a law of the velocity, no scatter."""
     fitted = np.asarray(problem.records.fitted)[..., joint] > 0
@@ -129,15 +164,23 @@ def _whitened_rows(
     return (rows * np.asarray(records.weight)[:, :, joint]).reshape(len(columns), -1).T
 
 
-def _left(rows: Rows, state: State, joint: int, smooth: Float[np.ndarray, "T k"]) -> Float[np.ndarray, " T"]:
-    """Residual of one joint's rows, the baseline's coefficients free for it alone (within their prior)."""
+def _left(
+    rows: Rows,
+    state: State,
+    joint: int,
+    smooth: Float[np.ndarray, "T k"],
+    used: Bool[np.ndarray, " T"] | None = None,
+) -> Float[np.ndarray, " T"]:
+    """Residual of one joint's rows, the baseline's coefficients free for it alone (within their prior) and fitted to
+    the rows `used`, by default all."""
     own = rows.X.own[joint]
     X = np.concatenate([own.columns, smooth], axis=1)
     precision = np.append(state.prior.precision[own.place], np.zeros(smooth.shape[1]))
     mean = np.append(state.prior.mean[own.place], np.zeros(smooth.shape[1]))
-    A = X.T @ X
+    asked = slice(None) if used is None else used
+    A = X[asked].T @ X[asked]
     A += np.diag(precision + RIDGE * np.diag(A) + 1e-12)
-    return rows.y[joint] - X @ np.linalg.solve(A, X.T @ rows.y[joint] + precision * mean)
+    return rows.y[joint] - X @ np.linalg.solve(A, X[asked].T @ rows.y[joint][asked] + precision * mean)
 
 
 def _bin_factors(residual: Float[np.ndarray, " rows"], speed: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " bins"]:

@@ -99,6 +99,7 @@ class Signals:
     rows: RowFilter
     load: Load | None  # known payload carried
     notes: tuple[str, ...]
+    stands: Bool[np.ndarray, "rows nv"] | None = None  # rows without weight because the joint stands; None: no row
 
 
 # by recording and shift: rate and gaps of its even grid, then times and columns at the working rate
@@ -158,9 +159,10 @@ def without_standing(prepared: Sequence[Signals]) -> tuple[Signals, ...]:
     lost = sum(((one.rows.weight > 0) & out).sum(0) for one, out in zip(prepared, stands, strict=True))
     there = sum((one.rows.weight > 0).sum(0) for one in prepared)
     moves = lost <= MOSTLY_STANDS * there
+    left_out = [out & moves & (one.rows.weight > 0) for one, out in zip(prepared, stands, strict=True)]
     return tuple(
-        replace(one, rows=eqx.tree_at(lambda r: r.weight, one.rows, np.where(out & moves, 0.0, one.rows.weight)))
-        for one, out in zip(prepared, stands, strict=True)
+        replace(one, stands=out, rows=eqx.tree_at(lambda r: r.weight, one.rows, np.where(out, 0.0, one.rows.weight)))
+        for one, out in zip(prepared, left_out, strict=True)
     )
 
 

@@ -52,6 +52,7 @@ class Records(eqx.Module):
     kept: Int[Leaf, "n M"]  # place of each row in the extended record
     weight: Float[Leaf, "n M nv"]  # what a row of the fit is multiplied by, at most 1; 0: not fitted
     judged: Float[Leaf, "n M nv"]  # 1: a row whose error counts in N m; 0: gated, gap, padding, holdout
+    standing: Float[Leaf, "n M nv"]  # 1: a row of a fit that is not judged because its joint stands
     low_pass: Float[Leaf, " F"]  # response of the row filter
     omega: Float[Leaf, " F"]  # rad/s
     dt: Float[Leaf, ""] | float  # s, of the samples
@@ -184,6 +185,7 @@ def stack(signals: Sequence[Signals], model: RobotModel | None = None, joined: b
         return [np.concatenate([np.asarray(each[k]) for k in members]) for members in slots]
 
     weight = _padded(behind([s.rows.weight * (s.role == "fit") for s in signals]), count, hold=False)
+    stands = [np.zeros(s.rows.weight.shape) if s.stands is None else s.stands * (s.role == "fit") for s in signals]
     torque = [np.zeros_like(s.velocity) if s.torque is None else s.torque for s in signals]
     return Records(
         time=_padded(behind([s.time for s in signals]), samples),
@@ -195,6 +197,7 @@ def stack(signals: Sequence[Signals], model: RobotModel | None = None, joined: b
         kept=_padded(kept, count),
         weight=weight,
         judged=weight,
+        standing=_padded(behind(stands), count, hold=False),
         low_pass=gain(length, first.dt, first.cutoff),
         omega=2 * np.pi * np.fft.rfftfreq(length, first.dt),
         dt=first.dt,
