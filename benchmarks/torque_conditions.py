@@ -482,6 +482,7 @@ def _moved(
         return q, v, tau - np.array([_pushed(hidden, x, start, travel) for x in q])
     model.dof_frictionloss[:], model.dof_damping[:] = dry, viscous
     model.dof_solref[:], model.dof_solimp[:, :3] = (0.002, 1.0), (0.999, 0.9999, 1e-3)  # it holds as dry friction does
+    model.dof_armature[[k for k in range(model.nv) if k not in moving]] = 1e6  # locked
     data.qpos[:] = q[0]
     MADE.mj_forward(model, data)
     dense = np.zeros((model.nv, model.nv))
@@ -492,9 +493,6 @@ def _moved(
         push = _pushed(hidden, data.qpos, start, travel)
         MADE.mj_fullM(model, data, dense)
         force = dense @ (a[k] + rates**2 * (q[k] - data.qpos) + 1.6 * rates * (v[k] - data.qvel)) + data.qfrc_bias
-        for i in range(model.nv):
-            if i not in moving:
-                force[i] += 500.0 * dense[i, i] * (q[k, i] - data.qpos[i]) * 100
         data.qfrc_applied[:] = force + push
         if k % every == 0:
             got[k // every], speed[k // every], tau[k // every] = data.qpos, data.qvel, force

@@ -17,6 +17,8 @@ from jaxtyping import Bool, Float
 
 from ..effects.base import Effect
 from ..effects.catalogue import find
+from ..effects.registry import related
+from ..effects.sensors import TorqueOffset
 from ..estimation.joint_rows import JointRows
 from ..estimation.rows import Prior
 from ..recordings.stacked import filter_rows, filtered_rows, open_rows
@@ -449,7 +451,8 @@ def _shares_of_torque(problem: Problem, state: State, torque: np.ndarray, effect
 
     The latter is the RMS in which each row counts as much as the cause's square there: a play that is crossed for some
     hundredths of a second is nothing at all other times. Of a drive at its limit all samples count too: the ends of a
-    recording have no rows, and may be where it is reached most.
+    recording have no rows, and may be where it is reached most. What is a constant while the joint moves is no more
+    than it adds to one that the baseline has: the two are a pair of large numbers of which one takes the other off.
     """
     response = state.response(problem.records.omega)
     if kind(effect) == "response":
@@ -457,6 +460,9 @@ def _shares_of_torque(problem: Problem, state: State, torque: np.ndarray, effect
         response = response * (1 - 1 / own)
     fitted = np.asarray(problem.records.judged)
     rows = open_rows(problem.records, torque, response) * fitted
+    if TorqueOffset.name in related(effect.name, "indistinguishable_from"):
+        known = [t for t in state.terms if isinstance(t, TorqueOffset) and set(effect.places) <= set(t.places.ravel())]
+        rows -= bool(known) * fitted * rows.sum((0, 1)) / np.maximum(fitted.sum((0, 1)), 1)
     (size, fourth), whole = ((rows**k).sum((0, 1)) for k in (2, 4)), ((problem.torque * fitted) ** 2).sum((0, 1))
     own = fitted.sum((0, 1)) * fourth / np.maximum(size, 1e-300)
     shares = [float(np.sqrt((x / np.maximum(whole, 1e-12 * whole.max())).max())) for x in (size, own)]
