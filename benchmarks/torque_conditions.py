@@ -440,8 +440,8 @@ def _reference(
                 wave = wave * _begun(t / 1.0)
             q[:, k] = wave
     q *= travel
-    v = np.gradient(q, step, axis=0)
-    return q, v, np.gradient(v, step, axis=0)
+    v = np.asarray(np.gradient(q, step, axis=0))
+    return q, v, np.asarray(np.gradient(v, step, axis=0))
 
 
 def _begun(time: np.ndarray) -> np.ndarray:

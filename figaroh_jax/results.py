@@ -178,7 +178,7 @@ class Trace:
     before: Float[np.ndarray, "samples nv"]
     after: Float[np.ndarray, "samples nv"]
     shares: dict[str, Float[np.ndarray, "samples nv"]] = field(default_factory=dict)  # torque of each cause
-    counted: Bool[np.ndarray, "samples nv"] | None = None  # False: near a gap, or below a gate; None: all count
+    counted: Bool[np.ndarray, "samples nv"] | None = None  # False: near a gap, below a gate, at rest; None: all
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,7 @@ from ..formats.robotfile import load_robot, stated_baseline, welded_to
 from ..recordings.bandwidth import note_on
 from ..recordings.checks import checked_recordings
 from ..recordings.dataset import Recording, read_recordings
-from ..recordings.signals import Signals, kept_out_in_vain
+from ..recordings.signals import Signals, kept_out_in_vain, stands_at_times
 from ..results import Cause, Diagnosis, Experiment, Name, Nearest, Rest, Verdict
 from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
@@ -640,6 +640,7 @@ def _scheme(signals: Sequence[Signals]) -> str:
 
 def _notes(signals: Sequence[Signals], here: Setting, last: Step) -> tuple[str, ...]:
     notes = [*(note for s in signals for note in s.notes), *repeats_not_said(signals), *kept_out_in_vain(signals)]
+    notes += stands_at_times(signals, here.problem.model.dof_names)
     if not here.problem.layout.repeats:
         notes.append(
             "no recording repeats another: the noise is estimated from the residual of a flexible model, which is less"

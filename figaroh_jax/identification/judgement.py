@@ -307,6 +307,8 @@ def dropped(signals: Sequence[Signals], model: RobotModel) -> tuple[str, ...]:
         text = f"{one.name}: {one.rows.kept} rows per joint at {1 / (one.dt * one.rows.step):.4g} Hz, low-passed at"
         text += f" {one.cutoff:.4g} Hz"
         if lost:
-            text += "; excluded by gate, mask or gap: " + ", ".join(f"{name} {n}" for name, n in lost.items())
+            text += "; excluded by gate, mask, gap or because the joint stands: " + ", ".join(
+                f"{name} {n}" for name, n in lost.items()
+            )
         out.append(text)
     return tuple(out)

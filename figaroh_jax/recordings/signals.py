@@ -58,6 +58,7 @@ __all__ = [
     "moves_as",
     "prepare",
     "prepare_all",
+    "stands_at_times",
     "to_recording_times",
 ]
 
@@ -72,6 +73,7 @@ MOST_STALE = 3  # of them in a row
 STILL = 1e-12  # of rad or m: what a joint that stands still moves by rounding
 CARRIES = 0.5  # periods of the cutoff to which the row filter carries what happens at a joint's rest
 STANDS = 0.01  # of a joint's top speed
+WORTH_TELLING = 0.05  # of a joint's rows at which it stands
 MOSTLY_STANDS = 0.9  # of a joint's rows
 HALF_OCTAVE = 2**-0.5
 WORTH_A_STEP = 0.1  # fall of the squares that a model leaves of the torque (mean logarithm) for half an octave less
@@ -163,6 +165,19 @@ def without_standing(prepared: Sequence[Signals]) -> tuple[Signals, ...]:
     return tuple(
         replace(one, stands=out, rows=eqx.tree_at(lambda r: r.weight, one.rows, np.where(out, 0.0, one.rows.weight)))
         for one, out in zip(prepared, left_out, strict=True)
+    )
+
+
+def stands_at_times(signals: Sequence[Signals], joints: Sequence[str]) -> tuple[str, ...]:
+    """Which of the joints stand in how many of their rows, which are not judged, in words."""
+    every = [one.stands for one in signals if one.stands is not None]
+    share = np.concatenate(every).mean(axis=0) if every else np.zeros(len(joints))
+    told = [f"{name} {100 * part:.0f} %" for name, part in zip(joints, share, strict=True) if part >= WORTH_TELLING]
+    if not told:
+        return ()
+    return (
+        "dry friction holds a joint that stands with any torque up to its limit: rows at rest are not judged, and left"
+        f" out of the fit where they contradict the motion ({', '.join(told)})",
     )
 
 
