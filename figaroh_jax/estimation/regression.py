@@ -261,7 +261,8 @@ def _cut(one: Signals, where: slice, rows: Int[np.ndarray, " mine"]) -> Signals:
         first=int(one.rows.index[rows[0]]) - where.start,
         kept=len(rows),
     )
-    return replace(one, torque=None if one.torque is None else one.torque[where], rows=kept, **signals)
+    torque, stands = None if one.torque is None else one.torque[where], None if one.stands is None else one.stands[rows]
+    return replace(one, torque=torque, stands=stands, rows=kept, **signals)
 
 
 def _one(records: Records, k: int) -> Records:
