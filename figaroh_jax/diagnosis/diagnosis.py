@@ -75,7 +75,7 @@ if TYPE_CHECKING:
 
 __all__ = ["diagnose", "diagnose_task"]
 
-NEARLY = 1.03  # times the held-out squares of a search, up to which it is worth another one from other causes
+NEARLY = 1.1  # times the held-out squares of a search, up to which it is worth another one from other causes
 
 
 def diagnose_task(
