@@ -101,6 +101,8 @@ def test_rows_at_which_a_joint_stands_have_no_weight_and_those_of_a_reversal_hav
     assert signals.stands is not None
     assert signals.stands[inside, 0].all() and not weight[inside, 0].any()
     assert weight[outside].all() and weight[:, 1].all()  # the second joint only turns round
+    (free,) = prepare_all([recording(q=q, tau=tau, time=t)], Preprocess(cutoff=10, rate=50), sticks=False)
+    assert free.stands is None and np.asarray(free.rows.weight).all()  # a robot without dry friction
     still = np.where(np.arange(4000)[:, None] < 3900, q[:1], q)  # what hardly ever moves is not judged by its rests
     (signals,) = prepare_all([recording(q=still, tau=tau, time=t)], Preprocess(cutoff=10, rate=50))
     assert np.asarray(signals.rows.weight).all()

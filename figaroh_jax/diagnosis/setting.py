@@ -69,7 +69,8 @@ def prepared_signals(
     resampled: Resampled = {}
 
     def read(band: float | None, like: _Read | None = None) -> _Read:
-        prepared = prepare_all(recordings, preprocess, band=band, resampled=resampled)
+        sticks = known is None or known.coulomb
+        prepared = prepare_all(recordings, preprocess, band=band, resampled=resampled, sticks=sticks)
         signals = sorted(checked_repeats(prepared), key=lambda s: s.role == "holdout")
         if like and like.moves_as(signals):
             return like

@@ -111,7 +111,7 @@ def without_held(problem: Problem, state: State) -> Problem:
         smooth = _whitened_rows(problem, state, functions[joint], ones, joint)
         left = _left(rows, state, joint, smooth, moves)
         at_rest, moving = left[still] ** 2, left[moves] ** 2
-        if min(at_rest.mean() / moving.mean(), at_rest.sum() / moving.sum()) > HELD**2:
+        if at_rest.mean() > HELD**2 * moving.mean() and at_rest.sum() > HELD**2 * moving.sum():
             weight[..., joint] *= 1 - standing[..., joint]
     return problem.weighted(weight)
 

@@ -228,7 +228,7 @@ def torque_data(
     if not fitted or lacking is not None:
         raise InputError(f"{lacking.file} has no torque" if lacking else "no recording to fit: all have role holdout")
     _belong(robot, fitted)
-    signals = prepare_all(tuple(fitted), preprocess or Preprocess(), band=None, model=robot)
+    signals = prepare_all(tuple(fitted), preprocess or Preprocess(), band=None, model=robot, sticks=False)
     records = stack(signals, robot)
     places = records.source.shape[1]
     if places > PLACES:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..effects.base import Effect
+from ..effects.friction import CoulombFriction
 from ..effects.plausibility import implausible
 from ..errors import InputError, nearest
 from ..estimation.base_parameters import BaseParameters, base_parameters, essential
@@ -299,9 +300,11 @@ def _read(
     accuracy where friction makes the motion sharp.
     """
     resampled: Resampled = {}
+    options: dict[str, Any] = {"model": backend.robot, "resampled": resampled}
+    options["sticks"] = any(isinstance(term, CoulombFriction) for term in terms)
 
     def read(band: float | None) -> _Read:
-        signals = prepare_all(tuple(recordings), preprocess, band=band, model=backend.robot, resampled=resampled)
+        signals = prepare_all(tuple(recordings), preprocess, band=band, **options)
         regression = Regression(backend, terms, np.zeros(backend.robot.nv), signals, refused)
         wide = condense(regression, used, widths=widths_to_try(regression))
         data = wide.restricted(range(len(regression.names)))

@@ -128,11 +128,13 @@ def prepare_all(
     band: float | None = math.inf,
     model: RobotModel | None = None,
     resampled: Resampled | None = None,
+    sticks: bool = True,
 ) -> tuple[Signals, ...]:
     """`prepare` every recording at the same rates, and repeats of one excitation on grids that meet.
 
     Row k of a repeat's first recording is then row k + `align(first, repeat)` of the repeat, to a fiftieth of a row.
-    `band`, `model` and `resampled` as for `prepare`.
+    `band`, `model` and `resampled` as for `prepare`. Rows at which a joint stands have no weight, unless nothing
+    `sticks` (a model without dry friction) or the `model` has quaternions, whose root no drive holds.
     """
     rates = choose_rates(recordings, preprocess)
     prepared: list[Signals] = []
@@ -146,7 +148,7 @@ def prepare_all(
             more = {"band": band, "model": model, "resampled": resampled}
             signals = prepare(recording, preprocess, rates, shift=off, **more)
         prepared.append(signals)
-    return without_standing(prepared)
+    return without_standing(prepared) if sticks and (model is None or model.nq == model.nv) else tuple(prepared)
 
 
 def without_standing(prepared: Sequence[Signals]) -> tuple[Signals, ...]:
