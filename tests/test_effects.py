@@ -191,7 +191,9 @@ def test_a_base_tilts_about_two_axes_across_gravity_wherever_it_is_mounted(up: t
         axis = np.array([1.0, 0.0, 0.0])
     turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * angle).as_matrix()
     np.testing.assert_allclose(level_axes(-9.81 * way), turn[:, :2], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(level_axes((-9.81 * way).astype(np.float32)), turn[:, :2], rtol=0, atol=1e-5)
+    # how x and y turn has no limit towards straight down: the nearer, the more of the rounding of `way` shows
+    rounding = 1e-5 + 1e-6 / (1.0 + way[2] if way[2] > -1.0 else 1.0)
+    np.testing.assert_allclose(level_axes((-9.81 * way).astype(np.float32)), turn[:, :2], rtol=0, atol=rounding)
     model = eqx.tree_at(lambda m: m.gravity, load_urdf(fj.DEMO), jnp.asarray(-9.81 * way))
     told = find("gravity_tilt")(np.zeros(0, int), **{"x": 0.05, "y": -0.03})
     tilted = np.asarray(told.change(model).gravity)
