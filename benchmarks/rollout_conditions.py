@@ -23,6 +23,7 @@ import re
 import tempfile
 import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -189,21 +190,21 @@ def _robot(rng: np.random.Generator, most: int, kinds: list[str]) -> Robot:
             loss = f'armature="{armature[k]:.6g}" damping="{damping[k]:.6g}" frictionloss="{friction[k]:.6g}"'
             kind = "slide" if slides[k] else "hinge"
             own = f'<joint name="j{k}" type="{kind}" axis="{axes[k]}" ref="{zero[k]:.3g}" {loss}/>'
-            middle = _words(0.1 * half, -0.2 * half, half)
-            spins = _words(size * (1 + spin[k, 0]), 2 * size, size * spin[k, 1])
+            middle = words(0.1 * half, -0.2 * half, half)
+            spins = words(size * (1 + spin[k, 0]), 2 * size, size * spin[k, 1])
             link = f'<inertial pos="{middle}" mass="{mass[k]:.6g}" diaginertia="{spins}"/>'
             if geoms:
-                shape = f'fromto="0 0 0 {_words(0.2 * half, 0.0, length[k])}" size="{0.15 * length[k]:.5g}"'
+                shape = f'fromto="0 0 0 {words(0.2 * half, 0.0, length[k])}" size="{0.15 * length[k]:.5g}"'
                 link = f'<geom type="capsule" {shape} mass="{mass[k]:.6g}" contype="0" conaffinity="0"/>'
-            place = _words(0.0, 0.0, 0.1 if parent[k] < 0 else length[parent[k]])
+            place = words(0.0, 0.0, 0.1 if parent[k] < 0 else length[parent[k]])
             whole = f'<body name="body{k}" pos="{place}">{own}{link}{inside[k]}</body>'
             if parent[k] < 0:
                 inside[k] = whole
             else:
                 inside[parent[k]] += whole
         return (
-            f'<mujoco><compiler angle="radian" eulerseq="XYZ"/><option gravity="{_words(*pull)}">'
-            f'<flag contact="disable"/></option><worldbody><body name="stand" euler="{_words(*turn)}">{inside[0]}'
+            f'<mujoco><compiler angle="radian" eulerseq="XYZ"/><option gravity="{words(*pull)}">'
+            f'<flag contact="disable"/></option><worldbody><body name="stand" euler="{words(*turn)}">{inside[0]}'
             f"</body></worldbody><actuator>{drives}</actuator></mujoco>"
         )
 
@@ -221,10 +222,10 @@ def _robot(rng: np.random.Generator, most: int, kinds: list[str]) -> Robot:
     lines, stated = [], {}
     for k in range(n):
         limit = strong * (load[k] + friction[k])
-        more = f' forcerange="{_words(-limit, limit)}"' if drive == "limited" else ""
+        more = f' forcerange="{words(-limit, limit)}"' if drive == "limited" else ""
         more += ' timeconst="0.03"' if drive == "filtered" else ""
         gains = f'kp="{kp[k] / gear**2:.6g}" kv="{kv[k] / gear**2:.6g}" gear="{gear:g}"'
-        law = f'gainprm="{kp[k]:.6g}" biastype="affine" biasprm="{_words(0.0, -kp[k], -kv[k])}"'
+        law = f'gainprm="{kp[k]:.6g}" biastype="affine" biasprm="{words(0.0, -kp[k], -kv[k])}"'
         one = f'general name="m{k}" joint="j{k}" {law}'
         lines.append(f"<{one}/>" if drive == "general" else f'<position name="m{k}" joint="j{k}" {gains}{more}/>')
         stated[f"j{k}"] = {"kind": "position", "kp": float(f"{kp[k]:.6g}"), "kd": float(f"{kv[k]:.6g}")}
@@ -245,7 +246,7 @@ def _robot(rng: np.random.Generator, most: int, kinds: list[str]) -> Robot:
     return Robot(real, file, names, travel, slides, friction, load, numbers, stated if drive == "stated" else {}, told)
 
 
-def _words(*numbers: float) -> str:
+def words(*numbers: float) -> str:
     return " ".join(f"{x:.6g}" for x in numbers)
 
 
@@ -287,7 +288,7 @@ def _moved(
     if effect == "payload":
         _loaded(model, 0.08 * size)
     if effect == "gravity_tilt":
-        model.opt.gravity[:] = _tilted(model.opt.gravity.copy(), 0.03 * size)
+        model.opt.gravity[:] = tilted(model.opt.gravity.copy(), 0.03 * size)
     data = MADE.MjData(model)
     drives = [int(model.actuator(f"m{name[1:]}").id) for name in robot.names]
     gears = np.array([model.actuator_gear[a, 0] for a in drives])
@@ -356,7 +357,7 @@ def _loaded(model: Any, mass: float) -> None:
     MADE.mj_setConst(model, MADE.MjData(model))
 
 
-def _tilted(gravity: np.ndarray, angle: float) -> np.ndarray:
+def tilted(gravity: np.ndarray, angle: float) -> np.ndarray:
     """Gravity turned about an axis across it."""
     across = np.cross(gravity, [0.3, 1.0, 0.5])
     across /= np.linalg.norm(across)
@@ -365,41 +366,49 @@ def _tilted(gravity: np.ndarray, angle: float) -> np.ndarray:
 
 def answered(case: Case, jobs: list[str]) -> tuple[list[str], list[str]]:
     """How each command did, in a word and in a line."""
-    marks, lines = [], []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for k, arrays in enumerate(case.recordings):
             np.savez(folder / f"run{k}.npz", **arrays)  # pyright: ignore[reportArgumentType]
         (folder / "robot.xml").write_text(case.file)
         (folder / "task.yaml").write_text(yaml.safe_dump(case.task))
-        for job in jobs:
-            said, began = io.StringIO(), time.process_time()
-            with (
-                contextlib.redirect_stdout(said),
-                contextlib.redirect_stderr(said),
-                warnings.catch_warnings(record=True) as noted,
-            ):
-                warnings.simplefilter("always")
-                status = command_line([job, str(folder / "task.yaml"), "--out", str(folder / job), "--quiet"])
-            used = f", {time.process_time() - began:.0f} CPU s"
-            if status:
-                marks.append("error")
-                lines.append(f"{job}: {status} {' '.join(said.getvalue().split())[-600:]}{used}")
-                continue
-            mark, line = (_diagnosed if job == "diagnose" else _identified)(case, folder / job)
-            marks.append("warning" if noted else mark)
-            lines.append(f"{job}: {line}{used}" + "".join(f"; {one.message}" for one in noted[:1]))
+        return asked(folder, jobs, lambda job: (_diagnosed if job == "diagnose" else _identified)(case, folder / job))
+
+
+def asked(folder: Path, jobs: list[str], judged: Callable[[str], tuple[str, str]]) -> tuple[list[str], list[str]]:
+    """How each command did on the folder's `task.yaml`, in a word and in a line; `judged` reads what it wrote."""
+    marks, lines = [], []
+    for job in jobs:
+        said, began = io.StringIO(), time.process_time()
+        with (
+            contextlib.redirect_stdout(said),
+            contextlib.redirect_stderr(said),
+            warnings.catch_warnings(record=True) as noted,
+        ):
+            warnings.simplefilter("always")
+            status = command_line([job, str(folder / "task.yaml"), "--out", str(folder / job), "--quiet"])
+        used = f", {time.process_time() - began:.0f} CPU s"
+        if status:
+            marks.append("error")
+            lines.append(f"{job}: {status} {' '.join(said.getvalue().split())[-600:]}{used}")
+            continue
+        mark, line = judged(job)
+        marks.append("warning" if noted else mark)
+        lines.append(f"{job}: {line}{used}" + "".join(f"; {one.message}" for one in noted[:1]))
     return marks, lines
 
 
 def _diagnosed(case: Case, out: Path) -> tuple[str, str]:
+    return diagnosed(out, lambda name: _same(name, case.truth))
+
+
+def diagnosed(out: Path, same: Callable[[tuple[str, str]], bool]) -> tuple[str, str]:
+    """The grade of an answer, and its line; `same` says whether a name is the truth."""
     answer = json.loads((out / "answer.json").read_text())
     names = [(c["effect"], " ".join(c["at"])) for c in answer["causes"]]
     sets = [[(o["effect"], " ".join(o["at"])) for o in c["ambiguous_with"]] for c in answer["causes"]]
-    fair = [
-        _same(one, case.truth) or any(_same(o, case.truth) for o in also) for one, also in zip(names, sets, strict=True)
-    ]
-    right = any(_same(one, case.truth) for one in names)
+    fair = [same(one) or any(map(same, also)) for one, also in zip(names, sets, strict=True)]
+    right = any(same(one) for one in names)
     mark = "wrong" if not all(fair) else "right" if right else "set" if any(fair) else answer["verdict"]
     line = f"{answer['verdict']}, {', '.join(' '.join(one) for one in names) or 'no cause'}"
     line += f"; alike {sets}" if any(sets) else ""
