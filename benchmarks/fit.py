@@ -91,7 +91,7 @@ def tx40(data_dir: Path, folder: Path) -> tuple[Any, ...]:
     basis = fj.linear_basis(model, data)
     linear = fj.fit_linear(model, data, basis)
     with jax.enable_x64(True):
-        signals = prepare_all(recordings, task.preprocess, band=None, model=robot)
+        signals = prepare_all(recordings, task.preprocess, band=None, model=robot, sticks=False)
         terms = friction_terms(robot, task.baseline)
         regression = Regression(as_backend(robot), terms, np.zeros(robot.nv), signals)
         used = np.abs(structural_columns(robot, terms)).max(axis=0) > 0
