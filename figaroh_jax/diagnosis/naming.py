@@ -27,6 +27,7 @@ from .comparison import Ground, Hypothesis, Verdicts, fold_sums, ground, judge, 
 from .design import fitted_fields, kind, sensor_response
 from .estimates import Fitted, amplitude_places, torque_slope
 from .flexible import smooth_functions, to_unit
+from .gaining import outdone_beside
 from .gates import physical_sign
 from .holdout import residual_rms
 from .joint import Joint
@@ -361,7 +362,7 @@ def standings(
                 and kind(effect) == "columns"
                 and _spoils(*(_by_joint(problem, v, full) for v in (without, full.verdicts))),
                 everywhere=not whole and any(name.effect in EVERYWHERE for name in one.ambiguous),
-                outdone=one.outdone,
+                outdone=bool(one.outdone) and outdone_beside(problem, start, joint, found, one, whitening),
                 shown=effect.shown_by(*problem.reached),
                 massless=effect.body and _deviations(effect, joint.fitted, at)["mass"] < MASS,
             )

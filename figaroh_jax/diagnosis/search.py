@@ -81,14 +81,14 @@ class Found:
     joints: tuple[int, ...] = ()  # by whose rows it is judged
     alike: tuple[Name, ...] = ()  # what else explains much of the same misfit, though not as well
     instead: tuple[Rival, ...] = ()  # of the `ambiguous` those that were fitted in its place
-    outdone: bool = False  # whether what could be named in its place predicts better in nearly all draws of the blocks
+    outdone: tuple[Rival, ...] = ()  # what could be named in its place and predicts better in nearly all draws
     share: float = 0.0  # of the held-out squares of its joints, as it came in
 
     def as_another(self, other: Rival, alike: Iterable[Name]) -> Found:
         """The same cause by another's name, effect and joints; `alike` is what then cannot be told from it."""
         known = tuple(name for name in alike if name != other.name)
         own = {"name": other.name, "effect": other.effect, "joints": other.joints}
-        return replace(self, **own, ambiguous=known, outdone=False)
+        return replace(self, **own, ambiguous=known, outdone=())
 
 
 class Search(NamedTuple):
@@ -355,6 +355,8 @@ def _found(
     own = float(wins[0] + wins[1:][outer].sum())
     # where the links are not well known, those that they can stand for are no names
     apart = np.array([problem.trust <= c.effect.needs_trust and physical_sign(c.effect) for c in alike], bool)
+    better = [c for c, win, a, o in zip(alike, wins[1:], apart, outer, strict=True) if a and not o and win > 0]
+    outdone = own < OUTDONE * (own + wins[1:][apart & ~outer].sum())
     before, after = (v.own(step.rows, best.joints) for v in (step.verdicts, best.verdicts))
     return Found(
         name=best.name,
@@ -368,7 +370,7 @@ def _found(
         joints=best.joints,
         alike=tuple(c.name for c in alike if step.verdicts.cost - c.verdicts.cost > SHARE_ALIKE * drop),
         instead=tuple(Rival(c.name, c.effect, c.joints) for c in alike if c.name in open_to),
-        outdone=own < OUTDONE * (own + wins[1:][apart & ~outer].sum()),
+        outdone=tuple(Rival(c.name, c.effect, c.joints) for c in better) if outdone else (),
         share=1 - float(after.sum() / before.sum()),
     )
 
