@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import collections
 import json
+import re
 import sys
 import tempfile
 from pathlib import Path
@@ -265,6 +266,8 @@ def drawn(rng: np.random.Generator, args: argparse.Namespace) -> Case | None:
         f"{', deg' * degrees}, {table}{', velocity' * with_speed}{', motor' * motor}, {before}, {baseline}"
     )
     numbers = {f"friction j{k}": float(dry[k]) for k in moving}
+    if locked < 0 and effect == "nothing" and not with_load:
+        numbers |= _numbers(real_links, real_armature, dry, viscous)
     truth = (effect, at) if effect != "nothing" else None
     return Case(told, task, files, recordings, table, truth, numbers)
 
@@ -372,6 +375,20 @@ def _urdf(links: list[Link]) -> str:
 
 def _model(links: list[Link], pull: np.ndarray, armature: np.ndarray) -> Any:
     return MADE.MjModel.from_xml_string(_mjcf(links, pull, armature))
+
+
+def _numbers(links: list[Link], armature: np.ndarray, dry: np.ndarray, viscous: np.ndarray) -> dict[str, float]:
+    """Every link's ten numbers about its own frame, its drive's rotor and friction; no link's that stands turned."""
+    out = dict[str, float]()
+    for k, one in enumerate(links, 1):
+        out |= {f"Ia{k}": float(armature[k - 1]), f"fc{k}": float(dry[k - 1]), f"fv{k}": float(viscous[k - 1])}
+        out[f"off{k}"] = 0.0
+        if one.zero:
+            continue
+        about = one.inertia + one.mass * (one.com @ one.com * np.eye(3) - np.outer(one.com, one.com))
+        out |= {f"m{k}": one.mass} | {f"m{x}{k}": float(one.mass * c) for x, c in zip("xyz", one.com, strict=True)}
+        out |= {f"I{'xyz'[a]}{'xyz'[b]}{k}": float(about[a, b]) for a in range(3) for b in range(a, 3)}
+    return out
 
 
 def _sizes(
@@ -601,7 +618,18 @@ def _identified(case: Case, out: Path) -> tuple[str, str]:
     result = json.loads((out / "result.json").read_text())
     relative = ", ".join(f"{x:.3g}" for x in result["fit"]["relative"])
     held_out = "; ".join(", ".join(f"{x:.3g}" for x in one["relative"]) for one in (result["holdout"] or {}).values())
-    return "done", f"relative {relative}{f', held out {held_out}' if held_out else ''}"
+    told = f"relative {relative}{f', held out {held_out}' if held_out else ''}"
+    apart = {}
+    for one in result["base_parameters"]:
+        parts = re.findall(r"([+-]?) ?(?:([0-9.]+(?:e[+-]?[0-9]+)?) )?([A-Za-z]+[0-9]+)", one["expression"])
+        if one["status"] == "identified" and all(name in case.numbers for _, _, name in parts):
+            truth = sum(float(f"{sign}{size or 1}") * case.numbers[name] for sign, size, name in parts)
+            apart[one["expression"]] = (one["value"] - truth) / one["std"]
+    if apart:
+        inside = sum(abs(x) < 1.96 for x in apart.values())
+        worst = max(apart, key=lambda name: abs(apart[name]))
+        told += f", intervals hold {inside} of {len(apart)}, worst {worst} ({apart[worst]:.1f} std)"
+    return "done", told
 
 
 if __name__ == "__main__":

@@ -17,7 +17,9 @@ pytest.importorskip("mujoco")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.torque_conditions import answered, drawn
 from figaroh_jax import recording
+from figaroh_jax.estimation.columns import joint_labels
 from figaroh_jax.formats.config import load_task
+from figaroh_jax.formats.mjcf import load_mjcf
 from figaroh_jax.formats.recording_keys import Preprocess
 from figaroh_jax.identification.identification import identify_task
 from figaroh_jax.recordings.likeness import likeness
@@ -130,3 +132,25 @@ def test_identification_beside_rests_comes_to_the_friction_that_slides(tmp_path:
     told = {e.name.at[0]: e.parameters["force"].value for e in found.effects if e.name.effect == "coulomb_friction"}
     for name, value in told.items():
         assert value == pytest.approx(case.numbers[f"friction {name}"], rel=0.1)
+
+
+def test_a_joint_has_the_number_of_its_link_whatever_the_order_of_its_column(tmp_path: Path) -> None:
+    """`fc1` was the friction of the first column beside `m1` of the first link: here those of two joints."""
+    case = drawn(np.random.default_rng([8069, 91]), Namespace(effects=["nothing"], most=5))
+    assert case is not None and case.task["robot"]["joints"] == ["j1", "j0"]
+    assert case.numbers["fc1"] > 5 * case.numbers["fc2"] and case.numbers["fv1"] > 5 * case.numbers["fv2"]
+    answered(case, [], keep=tmp_path)
+    found = identify_task(load_task(tmp_path / "task.yaml"))
+    told = {one.expression: one for one in found.base}
+    for name in ("fc1", "fc2", "fv1", "fv2"):
+        assert told[name].value == pytest.approx(case.numbers[name], abs=4 * told[name].std), name
+        assert told[name].std < 0.05 * case.numbers[name]
+
+
+def test_joints_of_several_coordinates_and_behind_a_free_root_are_numbered_by_links(tmp_path: Path) -> None:
+    (tmp_path / "robot.xml").write_text(
+        """<mujoco><worldbody><body name="root"><freejoint/><geom size=".1"/><body name="leg"><joint name="a"/>
+        <geom size=".1"/><body name="ball"><joint type="ball" name="b"/><geom size=".1"/></body></body></body>
+        </worldbody></mujoco>"""
+    )
+    assert joint_labels(load_mjcf(tmp_path / "robot.xml"))[6:] == ("2", "3.1", "3.2", "3.3")

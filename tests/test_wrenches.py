@@ -152,7 +152,7 @@ def truth_of(folder: Path) -> dict[str, float]:
         out |= {f"m{k + 1}": m, f"mx{k + 1}": m * c[0], f"my{k + 1}": m * c[1], f"mz{k + 1}": m * c[2]}
         out |= {f"I{'xyz'[i]}{'xyz'[j]}{k + 1}": E[i, j] for i in range(3) for j in range(i, 3)}
     for k in range(2):
-        out |= {f"fv{k + 7}": VISCOUS[k], f"fc{k + 7}": COULOMB[k]}
+        out |= {f"fv{k + 2}": VISCOUS[k], f"fc{k + 2}": COULOMB[k]}  # the legs are the second and third link
     return out
 
 

@@ -18,7 +18,7 @@ from ..compiled.batching import CPU_OPTIONS, DRAFT_OPTIONS, FEW, on_the_host, pr
 from ..effects.base import Effect, Motion, columns, place, smooth_sign
 from ..effects.catalogue import find
 from ..errors import InputError
-from ..rigid.model import Joint, RobotModel
+from ..rigid.model import DOF_NAMES, Joint, RobotModel
 from ..simulators.contract import Backend
 from ..simulators.native import NativeBackend
 from .base_parameters import inertial_names
@@ -30,6 +30,7 @@ __all__ = [
     "column_names",
     "columns_of",
     "friction_terms",
+    "joint_labels",
     "motion_at",
     "random_states",
     "state_columns",
@@ -74,8 +75,28 @@ def _joints(model: RobotModel) -> list[Joint]:
     return [own[k] for k in range(model.nv)]
 
 
+def joint_labels(model: RobotModel) -> tuple[str, ...]:
+    """What stands behind `fv` or `fc` for each coordinate: the number of the link that its joint moves, in tree order.
+
+    It is that of `m1` to `Izz1`, whatever the order of the recording's columns. Coordinates of one spherical joint are
+    told apart: `fv3.1` to `fv3.3`.
+
+    >>> import figaroh_jax as fj
+    >>> fj.columns.joint_labels(fj.load_urdf(fj.DEMO))
+    ('1', '2', '3', '4')
+    """
+    labels = [""] * model.nv
+    for number, joint in enumerate(model.joints, 1):
+        if not joint.follows:
+            kinds = len(DOF_NAMES[joint.kind])
+            own = [f"{number}.{k + 1}" if kinds > 1 else f"{number}" for k in range(kinds)]
+            labels[joint.coordinate : joint.coordinate + kinds] = own
+    return tuple(labels)
+
+
 def column_names(model: RobotModel, terms: Sequence[Effect]) -> tuple[str, ...]:
-    """`m1` to `Izz1` and on for the links in tree order, then `fv1`, `fc1` ... of the joints, then other effects.
+    """`m1` to `Izz1` and on for the links in tree order, then `fv1`, `fc1` ... of the joints that move them (not in the
+    order of the columns: `joint_labels`), then other effects.
 
     >>> import figaroh_jax as fj
     >>> robot = fj.load_urdf(fj.DEMO)
@@ -83,11 +104,11 @@ def column_names(model: RobotModel, terms: Sequence[Effect]) -> tuple[str, ...]:
     >>> fj.columns.column_names(robot, terms)[:4], len(fj.columns.column_names(robot, terms))
     (('m1', 'mx1', 'my1', 'mz1'), 52)
     """
-    names = list(inertial_names(model))
+    names, joints = list(inertial_names(model)), joint_labels(model)
     for term in terms:
         amplitudes = term.amplitudes()
         for at in np.asarray(term.at):
-            where = "_".join(str(k + 1) for k in at)
+            where = "_".join(joints[k] if term.acts_on in ("joint", "pair") else str(k + 1) for k in at)
             short = SHORT_NAMES.get(term.name)
             names += [f"{short}{where}" if short else f"{term.name}.{name}{where}" for name in amplitudes]
     return tuple(names)

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..estimation.columns import joint_labels
 from ..estimation.regression import Condensed, Regression
 
 __all__ = ["WIDTHS", "widths_to_try", "with_reversal_widths"]
@@ -36,8 +37,8 @@ def with_reversal_widths(
     `wide` is the regression condensed with the columns of `widths_to_try`; `kept` are the base columns, `weight` the
     joints' inverse variances.
     """
-    names, nv = regression.names, regression.model.nv
-    coulomb = [names.index(f"fc{j + 1}") if f"fc{j + 1}" in names else None for j in range(nv)]
+    names = regression.names
+    coulomb = [names.index(f"fc{k}") if f"fc{k}" in names else None for k in joint_labels(regression.model)]
     if not any(column in kept for column in coulomb if column is not None):
         return regression
     factor = wide.factor(weight)
