@@ -48,6 +48,7 @@ EFFECTS = (
     "encoder_offset",
 )
 IN_LOOP = ("payload", "rotor_inertia", "joint_spring", "gravity_tilt", "torque_ripple")  # as the robot itself has them
+ASKED_FOR = ("joint_elasticity",)  # drawn by --effects alone, so that a seed stays the case that it was
 AXES = ("1 0 0", "0 1 0", "0 0 1", "0 -1 0", "0.6 0 0.8", "0 0.8 0.6")
 ALIKE = (
     {"payload", "link_inertia"},
@@ -83,7 +84,7 @@ class Case(NamedTuple):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", nargs=2, type=int, default=[0, 60], metavar=("FIRST", "END"))
-    parser.add_argument("--effects", nargs="+", choices=["nothing", *EFFECTS], default=[])
+    parser.add_argument("--effects", nargs="+", choices=["nothing", *EFFECTS, *ASKED_FOR], default=[])
     parser.add_argument("--most", type=int, default=5, help="joints of a robot")
     parser.add_argument("--commands", nargs="+", choices=["diagnose", "identify"], default=["diagnose", "identify"])
     parser.add_argument("--keep", type=Path, help="folder that keeps every case's files")
@@ -182,6 +183,8 @@ def drawn(rng: np.random.Generator, args: argparse.Namespace) -> Case | None:
         read = q.copy()
         if effect == "encoder_offset":
             read[:, j] += 0.1 * size * travel[j]
+        if effect == "joint_elasticity":  # an encoder on the motor of a gear that winds up
+            read[:, j] += 0.02 * size * travel[j] * _rigid(carried, q, v, rate)[:, j] / load[j]
         if counts:
             step = 2 * np.pi / counts * travel
             read = np.round(read / step) * step

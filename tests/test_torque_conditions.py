@@ -47,6 +47,22 @@ def test_a_strangers_recording_gets_its_cause(seed: int, mark: str) -> None:
     assert marks == [mark], (case.told, lines)
 
 
+@pytest.mark.parametrize(
+    ("seed", "effects", "mark"),
+    [
+        pytest.param(7036, [], "unknown", id="steps of an encoder that a gear's resonance filters out"),
+        pytest.param(50, [], "unknown", id="the same of five joints beside an error of an encoder"),
+        pytest.param(9046, ["joint_elasticity"], "right", id="a gear that winds up"),
+        pytest.param(9031, ["joint_elasticity"], "right", id="the same beside rests"),
+    ],
+)
+def test_steps_of_an_encoder_are_no_elasticity(seed: int, effects: list[str], mark: str) -> None:
+    case = drawn(np.random.default_rng([seed, 91]), Namespace(effects=effects, most=5))
+    assert case is not None
+    marks, lines = answered(case, ["diagnose"])
+    assert marks == [mark], (case.told, lines)
+
+
 @pytest.mark.slow
 def test_no_robot_whose_joints_rest_gets_a_name() -> None:
     """Six drawn at run time that hide nothing: more than one named is no chance (one of a hundred is)."""

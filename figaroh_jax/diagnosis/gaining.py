@@ -14,14 +14,13 @@ from ..effects.base import Effect
 from ..estimation.noise import Spectrum, whitening
 from ..estimation.rows import Prior
 from ..results import Gain, Name
-from .comparison import shares_of_wins
-from .holdout import Held, held_squares, kept_out_error, weighted_of_errors, weighted_squares, whitened_wanted
+from .holdout import Held, held_squares, weighted_of_errors, weighted_squares, whitened_wanted
 from .joint import Joint, polished
 from .problem import Problem
 from .search import Found, stood_without
 from .state import State
 from .step import Step, stand
-from .thresholds import BY_CHANCE, BY_CHANCE_BESIDE, BY_CHANCE_UNSHOWN, GAIN, HELD, KEPT_OF_CLAIM, OUTDONE, RISES
+from .thresholds import BY_CHANCE, BY_CHANCE_BESIDE, BY_CHANCE_UNSHOWN, GAIN, HELD, KEPT_OF_CLAIM, RISES
 
 __all__ = [
     "Fall",
@@ -30,7 +29,6 @@ __all__ = [
     "fall",
     "foretells",
     "kept_squares",
-    "outdone_beside",
     "predicts_better",
     "surely_less",
     "without_losses",
@@ -264,27 +262,6 @@ def predicts_better(
     drop, had = (worse.squares - better.squares)[1][:, places], worse.squares[1][:, places].sum(0)
     gain = (drop / np.maximum(had, 1e-300)).sum(1)
     return bool(gain.sum() > GAIN * len(places) and _by_chance(gain) < BY_CHANCE)
-
-
-def outdone_beside(
-    problem: Problem, start: State, joint: Joint, found: list[Found], one: Found, whitening: Float[np.ndarray, "F nv"]
-) -> bool:
-    """Whether what predicted better than a cause as it came in does so in its place beside all others, too.
-
-    As it comes in, the misfits of all causes to come are still there, and a rival with more numbers follows some of
-    them as well. Recordings kept out may reject it, however well it does on slices of those that are fitted.
-    """
-    known, at, error = [f.name for f in found], found.index(one), kept_out_error(problem, joint.step)
-    blocks = [joint.step.verdicts.blocks]
-    for other in one.outdone:
-        if other.name in known:  # beside which it has come in
-            continue
-        causes = [other.effect if k == at else e for k, e in enumerate(joint.causes)]
-        step = polished(problem, start, causes, whitening).step
-        both = sorted({*one.joints} & {*other.joints})
-        if not (problem.held.any() and predicts_better(problem, kept_out_error(problem, step), error, both)):
-            blocks.append(step.verdicts.blocks)
-    return bool(shares_of_wins(np.stack(blocks), np.random.default_rng(0))[0] < OUTDONE)
 
 
 def foretells(problem: Problem, bare: Step, full: Step, spectrum: Spectrum) -> bool:

@@ -27,13 +27,13 @@ from .comparison import Ground, Hypothesis, Verdicts, fold_sums, ground, judge, 
 from .design import fitted_fields, kind, sensor_response
 from .estimates import Fitted, amplitude_places, torque_slope
 from .flexible import smooth_functions, to_unit
-from .gaining import outdone_beside
 from .gates import physical_sign
 from .holdout import residual_rms
 from .joint import Joint
 from .problem import Problem
 from .search import Found, judged_without, stood_without
 from .shifts import torque_change
+from .stand_ins import like_roughness, outdone_beside
 from .standstill import resting
 from .state import State, batched
 from .step import Step, stand
@@ -106,6 +106,7 @@ class Standing:
     complete: bool = False  # whether smooth functions find next to nothing in what it leaves at its joints
     spoils: bool = False  # whether, of the whole robot, it surely predicts some joint worse
     outdone: bool = False  # whether what could be named in its place surely predicts better
+    rough: bool = False  # whether a position that is only rough explains nearly as much
     shown: bool = True  # whether the motion tells it, as fitted, from any smooth law (`Effect.shown_by`)
     taken: float = 0.0  # held-out squares of its joints that it removes
     leaves: float = 0.0  # squares beyond noise at its joints over these
@@ -162,6 +163,7 @@ def _of_all(one: Standing, tolerance: float) -> Iterator[tuple[bool, str]]:
     )
     yield (not one.spoils, "it predicts a joint worse, which a right law of the whole robot does not")
     yield (not one.outdone, "another cause that explains the same misfit predicts better, though it is none itself")
+    yield (not one.rough, "errors of the position that an encoder's steps make explain nearly as much")
     yield (not one.massless, "its mass is not surely above zero: a link other than believed explains as much")
     yield (
         one.leaves <= LAW_LEAVES or not one.alone,
@@ -362,6 +364,7 @@ def standings(
                 and kind(effect) == "columns"
                 and _spoils(*(_by_joint(problem, v, full) for v in (without, full.verdicts))),
                 everywhere=not whole and any(name.effect in EVERYWHERE for name in one.ambiguous),
+                rough=like_roughness(problem, start, joint, found, one, whitening),
                 outdone=bool(one.outdone) and outdone_beside(problem, start, joint, found, one, whitening),
                 shown=effect.shown_by(*problem.reached),
                 massless=effect.body and _deviations(effect, joint.fitted, at)["mass"] < MASS,

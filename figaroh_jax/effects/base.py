@@ -317,6 +317,7 @@ class Effect(eqx.Module):
     vanishes: ClassVar[tuple[str, ...]] = ()  # shapes at whose zero it adds nothing, whatever its amplitudes
     about: ClassVar[tuple[str, str] | None] = None  # a shape about which its torque is linear in an amplitude: `exact`
     abrupt: ClassVar[bool] = False  # whether its `position_error` steps where the load changes its side
+    winds_up: ClassVar[bool] = False  # whether its `position_error` is the load's, as of a spring
     one_rotor: ClassVar[
         tuple[str, ...]
     ] = ()  # of a rotor that turns two joints: inertia, then what tells it from links

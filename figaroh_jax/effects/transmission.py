@@ -163,7 +163,7 @@ class JointSpring(JointEffect):
 class JointElasticity(JointEffect):
     """A gear that winds up under load: the sensor on the motor reads more than the link has turned."""
 
-    name, title = "joint_elasticity", "joint elasticity"
+    name, title, winds_up = "joint_elasticity", "joint elasticity", True
     equation = "q_measured = q + compliance tau_load"
     separated_by = "a chirp of {at} above a third of its resonance, or a sensor on the link side"
     in_rollouts = InRollouts(
