@@ -9,6 +9,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .recordings.bandwidth import Band
+
 __all__ = [
     "BoundedEstimate",
     "Candidate",
@@ -209,7 +211,7 @@ class Diagnosis(Selection):
     rest: Rest = field(default_factory=lambda: Rest(np.zeros(0)))
     notes: tuple[str, ...] = ()  # what was dropped or assumed while reading the data
     prismatic: tuple[bool, ...] = ()  # per joint; empty: every joint is revolute
-    band: float | None = None  # Hz, that positions were taken down to (`prepare`): predictions want the same
+    band: Band = None  # Hz, that positions were taken down to (`prepare`): predictions want the same
     of_positions: bool = False  # a rollout: residuals and traces are positions, not torques
     remark: str = ""  # a sentence that the headline says besides what is missing
     links: Links | None = None  # of the file, where the torque moves them further than they are believed

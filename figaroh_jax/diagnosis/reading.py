@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..formats.recording_keys import Preprocess
-from ..recordings.bandwidth import encoder_step
+from ..recordings.bandwidth import Band, encoder_step
 from ..recordings.dataset import Recording
 from ..recordings.resampling import read_clock
 from ..recordings.signals import Signals, prepare_all
@@ -42,7 +42,7 @@ class Reader:
     recordings: Sequence[Recording]
     signals: Sequence[Signals]
     preprocess: Preprocess
-    band: float | None
+    band: Band
 
     @property
     def rounding(self) -> Float[np.ndarray, " nv"]:

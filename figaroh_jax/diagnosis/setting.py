@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..estimation.noise import Spectrum
+from ..recordings.bandwidth import Band
 from ..recordings.dataset import Recording
-from ..recordings.signals import Resampled, Signals, as_slow_as_torque, prepare_all
+from ..recordings.signals import Resampled, Signals, as_slow_as_torque, joint_by_joint, prepare_all
 from ..recordings.stacked import stack
 from ..simulators.contract import Backend
 from .flexible import friction_width
@@ -46,7 +47,7 @@ class _Read(NamedTuple):
     """The recordings as they are prepared with one `band` of positions, and what the baseline then leaves."""
 
     signals: list[Signals]  # holdout recordings behind the others
-    band: float | None  # as for `prepare_all`
+    band: Band  # as for `prepare_all`
     begun: tuple[Problem, State]
     squares: Float[np.ndarray, " nv"]
 
@@ -57,7 +58,7 @@ class _Read(NamedTuple):
 
 def prepared_signals(
     backend: Backend, recordings: Sequence[Recording], preprocess: Preprocess, known: Baseline | None, trust: float
-) -> tuple[list[Signals], float | None, tuple[Problem, State]]:
+) -> tuple[list[Signals], Band, tuple[Problem, State]]:
     """The recordings prepared, holdout recordings behind the others, the `band` of their positions, the baseline.
 
     Each position is taken down to the band of its own motion only where the baseline then predicts left-out parts
@@ -65,10 +66,11 @@ def prepared_signals(
     ratio of its errors, so that one with a cause in it does not decide for all.
 
     Where that does no harm, all are taken down further for as long as the torque follows better (`as_slow_as_torque`).
+    Where it does, each joint is asked alone (`joint_by_joint`).
     """
     resampled: Resampled = {}
 
-    def read(band: float | None, like: _Read | None = None) -> _Read:
+    def read(band: Band, like: _Read | None = None) -> _Read:
         sticks = known is None or known.coulomb
         prepared = prepare_all(recordings, preprocess, band=band, resampled=resampled, sticks=sticks)
         signals = sorted(checked_repeats(prepared), key=lambda s: s.role == "holdout")
@@ -80,7 +82,7 @@ def prepared_signals(
     plain = read(None)
     own = read(math.inf, like=plain)
     better = own is plain or np.mean(np.log(own.squares / plain.squares)) < 0
-    best = as_slow_as_torque(own, read) if better else plain
+    best = as_slow_as_torque(own, read) if better else joint_by_joint(plain, own, read)
     return best.signals, best.band, best.begun
 
 

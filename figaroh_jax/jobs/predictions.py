@@ -7,6 +7,7 @@ import numpy as np
 
 from ..effects.extended import ExtendedModel, predict
 from ..formats.config import Task
+from ..recordings.bandwidth import Band
 from ..recordings.dataset import carrying, read_recordings
 from ..recordings.signals import choose_rates, prepare, to_recording_times
 
@@ -14,7 +15,7 @@ __all__ = ["predictions"]
 
 
 def predictions(
-    task: Task, extended: ExtendedModel, *, identified: bool = False, band: float | None = None
+    task: Task, extended: ExtendedModel, *, identified: bool = False, band: Band = None
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Time (s) and the extended model's torque (N m or N) of each holdout recording, on its own time stamps.
 

@@ -16,7 +16,11 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["encoder_step", "motion_band", "note_on", "smoothed"]
+__all__ = ["Band", "encoder_step", "motion_band", "note_on", "smoothed"]
+
+# Hz, that positions are taken down to where they show no band of their own below the cutoff; None: all are left at the
+# cutoff; a tuple: where each joint's are taken down to, or None
+Band = float | None | tuple[float | None, ...]
 
 ORDER = 3  # of the differences that smoothing holds small: gain 1 / (1 + (f / band)^(2 ORDER))
 STEPS = 2.0 ** (-np.arange(13) / 2)  # bands tried, as shares of the cutoff
@@ -30,9 +34,9 @@ LINE = 3  # bins to either side to which the window spreads a line
 READINGS = 4  # of a motion by an encoder, each with its steps at another place
 
 
-def note_on(band: float | None) -> tuple[str, ...]:
+def note_on(band: Band) -> tuple[str, ...]:
     """What is told of positions that `signals.as_slow_as_torque` has taken down."""
-    if band is None or math.isinf(band):
+    if not isinstance(band, float) or math.isinf(band):
         return ()
     return (
         f"positions are smoothed to {band:.3g} Hz: faster motion in them changes the model's torque, but the measured"

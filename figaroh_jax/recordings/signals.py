@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..errors import InputError
-from .bandwidth import encoder_step, motion_band, smoothed
+from .bandwidth import Band, encoder_step, motion_band, smoothed
 from .cleaning import near, without_untrusted
 from .dataset import Recording
 from .groupmotion import continued, group_rates, normalised
@@ -53,6 +53,7 @@ __all__ = [
     "common_rows",
     "filter_rows",
     "frequencies",
+    "joint_by_joint",
     "kept_out_in_vain",
     "let_through",
     "moves_as",
@@ -125,7 +126,7 @@ def prepare_all(
     recordings: Sequence[Recording],
     preprocess: Preprocess,
     *,
-    band: float | None = math.inf,
+    band: Band = math.inf,
     model: RobotModel | None = None,
     resampled: Resampled | None = None,
     sticks: bool = True,
@@ -201,7 +202,7 @@ def prepare(
     rates: Rates | None = None,
     *,
     shift: float = 0.0,
-    band: float | None = math.inf,
+    band: Band = math.inf,
     model: RobotModel | None = None,
     resampled: Resampled | None = None,
 ) -> Signals:
@@ -209,7 +210,8 @@ def prepare(
 
     `rates` are those of `choose_rates`, by default for this recording alone; `shift` (s, less than a row) moves the
     grid. A position is taken down to the band of its own motion where that is below the cutoff, else to `band` (Hz);
-    None leaves all at the cutoff. A `model` with quaternions in q takes the rates on its group (`groupmotion`).
+    None leaves all at the cutoff, a tuple says of each joint where. A `model` with quaternions in q takes the rates on
+    its group (`groupmotion`).
     `resampled` holds what calls that differ in `band` alone have in common: an empty dictionary at first. Raises
     `InputError` where the window, the cutoff or the rate do not fit the recording, or it is too short.
     """
@@ -236,7 +238,7 @@ def prepare(
             f" after {trim} s are cut at both ends, at least {FEWEST_ROWS} are needed"
         )
     if grouped is None:
-        bands = np.full(nv, rates.cutoff) if band is None else _bands(columns[0], dt, rates.cutoff, raw, rate, band)
+        bands = _bands(columns[0], dt, rates.cutoff, raw, rate, band)
         position = let_through(columns[0], dt, rates.cutoff, bands)
         moves = np.ptp(position, axis=0) > STILL * (1 + np.abs(position).max(axis=0))
         position[:, ~moves] = position[0, ~moves]  # dry friction would see the sign of rounding
@@ -270,7 +272,7 @@ class Read(Protocol):
     """Recordings whose positions are taken down to some band, and what a model of the robot leaves of their torque."""
 
     @property
-    def band(self) -> float | None:
+    def band(self) -> Band:
         """As for `prepare`."""
         ...
 
@@ -298,12 +300,33 @@ def as_slow_as_torque(best: R, read: Callable[[float], R], first: float = WORTH_
     """
     least = first
     while True:
-        slower = read(HALF_OCTAVE * min(best.band or math.inf, best.signals[0].cutoff))
+        least_yet = best.band if isinstance(best.band, float) else math.inf
+        slower = read(HALF_OCTAVE * min(least_yet, best.signals[0].cutoff))
         fall = np.log(best.squares / slower.squares)
         worth = np.mean(fall) >= least and min(fall) >= -AT_COST * np.mean(fall)  # not so where a square is no number
         if not worth or _takes_motion(best.signals, slower.signals):
             return best
         best, least = slower, WORTH_A_STEP
+
+
+def joint_by_joint(best: R, own: R, read: Callable[[Band], R]) -> R:
+    """The recordings with the position of each joint taken down by half octaves for as long as that alone helps.
+
+    Only joints are asked that show noise below the cutoff, in the `own` bands of their motion, and no further down than
+    these: a coarse encoder of one joint wants it, beside another whose motion is abrupt. A step helps as in
+    `as_slow_as_torque`, by the sum over the joints: one joint's position has little part in the others' torque.
+    """
+    cutoff, bands = own.signals[0].cutoff, np.min([signals.bands for signals in own.signals], axis=0)
+    limits: list[float | None] = [None] * len(bands)
+    for joint in np.flatnonzero(bands < cutoff):
+        while (lower := HALF_OCTAVE * (limits[joint] or cutoff)) > 0.99 * bands[joint]:
+            slower = read((*limits[:joint], lower, *limits[joint + 1 :]))
+            fall = np.log(best.squares / slower.squares)
+            helps = fall.sum() >= WORTH_A_STEP and fall.min() >= -AT_COST * fall.sum()
+            if not helps or _takes_motion(best.signals, slower.signals):
+                break
+            best, limits[joint] = slower, lower
+    return best
 
 
 def _takes_motion(before: Sequence[Signals], after: Sequence[Signals]) -> bool:
@@ -338,15 +361,19 @@ def _bands(
     cutoff: float,
     raw: Float[np.ndarray, "read nv"],
     rate: float,
-    most: float,
+    band: Band,
 ) -> Float[np.ndarray, " nv"]:
-    """The band of each joint's motion, Hz; `most`, where it does not show below the `cutoff`.
+    """The band of each joint's motion, Hz, and `band` where it does not show below the `cutoff`; a tuple says them all.
 
     `raw` are the samples as they were read, at `rate` (Hz): they show the steps of the encoder.
     """
+    if band is None:
+        return np.full(position.shape[1], cutoff)
+    if isinstance(band, tuple):
+        return np.array([min(limit or cutoff, cutoff) for limit in band])
     steps = [encoder_step(column) for column in raw.T]
     own = np.array([motion_band(x, dt, cutoff, step, rate) for x, step in zip(position.T, steps, strict=True)])
-    return np.where(own < cutoff, own, min(cutoff, most))
+    return np.where(own < cutoff, own, min(cutoff, band))
 
 
 def let_through(
