@@ -28,7 +28,7 @@ from ..estimation.least_squares import Solution, WeightedByJoint, solve
 from ..estimation.priors import rigid_prior
 from ..estimation.regression import Condensed, Regression, condense
 from ..formats.robotfile import load_robot, stated_baseline
-from ..recordings.bandwidth import Band, note_on
+from ..recordings.bandwidth import note_on
 from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Resampled, Signals, as_slow_as_torque, kept_out_in_vain, prepare_all
@@ -267,7 +267,7 @@ def _judged(
 class _Read(NamedTuple):
     """The recordings as they are prepared with one `band` of positions, condensed, and their first fit."""
 
-    band: Band  # as for `prepare_all`
+    band: float | None  # as for `prepare_all`
     regression: Regression
     wide: Condensed  # with the columns of all reversal widths
     base: BaseParameters
@@ -303,7 +303,7 @@ def _read(
     options: dict[str, Any] = {"model": backend.robot, "resampled": resampled}
     options["sticks"] = any(isinstance(term, CoulombFriction) for term in terms)
 
-    def read(band: Band) -> _Read:
+    def read(band: float | None) -> _Read:
         signals = prepare_all(tuple(recordings), preprocess, band=band, **options)
         regression = Regression(backend, terms, np.zeros(backend.robot.nv), signals, refused)
         wide = condense(regression, used, widths=widths_to_try(regression))

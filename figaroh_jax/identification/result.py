@@ -12,7 +12,6 @@ from jaxtyping import Float
 
 from ..effects.extended import ExtendedModel
 from ..estimation.solution import Fit
-from ..recordings.bandwidth import Band
 from ..results import Estimate, Name, Trace, finite
 
 __all__ = ["BaseParameter", "FittedEffect", "Identification", "Link", "Parameter", "Quality", "Status", "to_json"]
@@ -97,7 +96,7 @@ class Identification:
     correlations: tuple[tuple[str, str, float], ...] = ()  # of base parameters, the strongest
     notes: tuple[str, ...] = ()
     prismatic: tuple[bool, ...] = field(default=())
-    band: Band = None  # Hz, that positions were taken down to (`prepare`): predictions want the same
+    band: float | None = None  # Hz, that positions were taken down to (`prepare`): predictions want the same
 
     @property
     def model(self) -> ExtendedModel:
