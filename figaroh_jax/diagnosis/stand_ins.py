@@ -16,7 +16,7 @@ from .problem import Problem
 from .search import Found
 from .state import State
 from .step import Step
-from .thresholds import LIKE_ROUGHNESS, OUTDONE
+from .thresholds import LIKE_ROUGHNESS, OUTDONE, ROUGH
 
 __all__ = ["Rough", "like_roughness", "outdone_beside"]
 
@@ -63,9 +63,12 @@ def like_roughness(
 
     A link follows its motor up to its resonance. Where that lies below the cutoff, the gear is a low-pass filter of the
     position as well, and takes off what the steps of an encoder add. A gear that is there bends the motion the other
-    way below its resonance, and follows all of the load.
+    way below its resonance, and follows all of the load. Positions that were taken far below the cutoff are not rough.
     """
-    if not one.effect.winds_up:
+    bands = problem.records.bands
+    if not one.effect.winds_up or bands is None:
+        return False
+    if np.max(bands[:, int(one.effect.at[0])]) < ROUGH * float(problem.records.cutoff):
         return False
     at, rough = found.index(one), place(Rough, problem.model, one.name.at, width=1e-4)
     bare, other = (_with(problem, start, joint, at, instead, whitening).verdicts.cost for instead in ([], [rough]))

@@ -40,6 +40,7 @@ OVERLAP_SAME = 0.5  # overlap from which two causes explain the same misfit
 T_APART = 3.0  # t from which data tell effects apart that are the same while the joint moves
 OUTDONE = 0.1  # of the draws of the blocks: in fewer, a cause predicts best of those that could be named in its place
 LIKE_ROUGHNESS = 2 / 3  # of what a gear that winds up takes: what a rough position must not take in its place
+ROUGH = 0.45  # of the cutoff: a position that is taken down further is not
 MOST_OF_A_GAIN = 2 / 3  # of what a body in its place gains: from here a joint's cause is not outdone by it
 SHARE_ALIKE = 0.5  # share of the best's drop from which another cause explains much of the same
 SMALLEST = 0.0005  # share of the first cause's drop below which a later one may be what the first left over
