@@ -42,8 +42,11 @@ def outdone_beside(
     """Whether what predicted better than a cause as it came in does so in its place beside all others, too.
 
     As it comes in, the misfits of all causes to come are still there, and a rival with more numbers follows some of
-    them as well. Recordings kept out may reject it, however well it does on slices of those that are fitted.
+    them as well. Recordings kept out may reject it, however well it does on slices of those that are fitted. Without
+    them it stays outdone: two stand-ins for one cause each do better than that cause beside the other stand-in.
     """
+    if not problem.held.any():
+        return True
     known, error = [f.name for f in found], kept_out_error(problem, joint.step)
     blocks = [joint.step.verdicts.blocks]
     for other in one.outdone:
@@ -51,7 +54,7 @@ def outdone_beside(
             continue
         step = _with(problem, start, joint, found.index(one), [other.effect], whitening)
         both = sorted({*one.joints} & {*other.joints})
-        if not (problem.held.any() and predicts_better(problem, kept_out_error(problem, step), error, both)):
+        if not predicts_better(problem, kept_out_error(problem, step), error, both):
             blocks.append(step.verdicts.blocks)
     return bool(shares_of_wins(np.stack(blocks), np.random.default_rng(0))[0] < OUTDONE)
 
