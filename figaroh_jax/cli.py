@@ -146,6 +146,8 @@ def _run(args: argparse.Namespace) -> int:
 
         _write_out(export_loop(args.task, args.simulator, args.out))
         return 0
+    if args.command == "simulate":
+        return _simulate(args)
     return _run_job(args)
 
 
@@ -175,6 +177,23 @@ def _run_job(args: argparse.Namespace) -> int:
         return 0
     print(f"figaroh-jax: limit not met: {_one_line(done.failure)}", file=sys.stderr)
     return 1
+
+
+def _simulate(args: argparse.Namespace) -> int:
+    from .jobs.simulation import simulate
+    from .reporting import terminal
+
+    folder = args.task.resolve()
+    out = args.out or Path(f"{(folder.parent if folder.name == 'model' else folder).name}_simulation")
+    with terminal.Progress(quiet=args.quiet) as progress:
+        done = simulate(args.task, args.file, out, progress, interpolate=args.interpolate, start=args.start)
+    with _standard_output():
+        if args.json:
+            sys.stdout.write(done.to_json())
+        else:
+            done.show(args.verbose)
+            print(f"Motion: {out / 'simulation.csv'}")
+    return 0
 
 
 def _write_out(text: str) -> None:
@@ -282,6 +301,17 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--backend", help=argparse.SUPPRESS)
     export.add_argument("task", type=Path, metavar="MODEL_DIR", help="`model` of a run directory")
     export.add_argument("--for", dest="simulator", required=True, metavar="NAME", help="mujoco, newton, isaaclab, ...")
+    moved = commands.add_parser("simulate", help="move a run's model by the commands of a file")
+    moved.add_argument("task", type=Path, metavar="MODEL_DIR", help="a run directory, or its `model`")
+    moved.add_argument("--command", dest="file", type=Path, required=True, metavar="FILE", help="time and commands")
+    moved.add_argument("--interpolate", action="store_true", help="join the rows by lines instead of holding each")
+    moved.add_argument("--start", metavar="JOINT=VALUE,...", help="where it starts (rad, m), if FILE has no positions")
+    moved.add_argument("--out", type=Path, metavar="DIR", help="run directory; an earlier run there is replaced")
+    moved.add_argument("--json", action="store_true", help="print the answer as JSON instead of the summary")
+    moved.add_argument("--quiet", action="store_true", help="no progress on standard error")
+    moved.add_argument("--traceback", action="store_true", help="show where an error was raised")
+    moved.add_argument("--no-cache", action="store_true", help="keep no compiled programs for the next run")
+    moved.add_argument("--verbose", action="store_true", help=argparse.SUPPRESS)
     demo = commands.add_parser("demo", parents=[common], help="the main job on an embedded recording, no file needed")
     demo.set_defaults(task=None)
     return parser

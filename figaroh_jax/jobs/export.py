@@ -11,10 +11,9 @@ from ..errors import InputError, as_written
 from ..reporting.run_directory import refusals, write_file
 from ..rollouts import callback
 from ..rollouts.export import for_simulator, with_drives
+from ..rollouts.stored import LOOP
 
 __all__ = ["LOOP", "export_loop"]
-
-LOOP = "loop.json"
 
 
 def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:

@@ -19,7 +19,7 @@ from ..rigid.model import RobotModel
 from .reading import BAGS, kind_of, lerobot_episodes, read_table
 from .tables import Source, Table
 
-__all__ = ["Columns", "Undecided", "read_columns", "without_sign"]
+__all__ = ["Columns", "Commands", "Undecided", "read_columns", "read_commands", "without_sign"]
 
 _WORDS = {
     "command": {
@@ -413,3 +413,78 @@ def _matrix(table: Table, source: Any, joints: Sequence[str], key: str) -> Float
         row, column = wrong[0]
         raise InputError(f"{table.file}: {key} of {joints[column]} is {values[row, column]:.4g} in row {row} (from 0)")
     return values
+
+
+class Commands(NamedTuple):
+    """A file of commands: one column for each drive, and where the joints were where it says so."""
+
+    time: Float[np.ndarray, " samples"]  # s
+    command: Float[np.ndarray, "samples drives"]
+    joints: tuple[str, ...] = ()  # of position and velocity
+    position: Float[np.ndarray, "samples joints"] | None = None
+    velocity: Float[np.ndarray, "samples joints"] | None = None
+
+
+def read_commands(file: Path, drives: Sequence[str], of: Sequence[str], model: RobotModel, *, torque: bool) -> Commands:
+    """Time, commands and, where they are there, positions and velocities of a file, told by the names of its columns.
+
+    A column is of the drive whose name it holds, or of the joint that the drive moves (`of`); columns without such
+    names are taken in the drives' order. `torque`: the command is a torque, and columns called so are it. Raises
+    `InputError` with the columns of the file where they do not decide.
+    """
+    table = read_table(file, "recording")
+    clock = _time(table)
+    kinds = _kinds(table, clock)
+    wanted = ["command", *(["torque"] if torque else [])]
+    found = next((kinds[kind] for kind in wanted if kind in kinds), None)
+    found = found or [n for n in table.names if n in ("u", "ctrl") or re.fullmatch(r"(u|ctrl)[._\[]*\d+\]?", n)]
+    claimed = {name for names in kinds.values() for name in names} | {clock}
+    found = found or [n for n in table.names if n not in claimed and (_holds_any(n, drives) or _holds_any(n, of))]
+    if not found:
+        what = "torque (tau, torque, effort)" if torque else "command (command, cmd, u, target)"
+        raise InputError(
+            f"{file}: no column looks like a {what}; its columns are {', '.join(table.names[:12])}; name one column for"
+            f" each of {', '.join(drives)}"
+        )
+    command = _of_drives(table, found, drives, of)
+    time = table.vector(clock, "time")
+    if len(time) != len(command):
+        raise InputError(f"{file}: '{clock}' has {len(time)} rows, the command {len(command)}")
+    back = np.flatnonzero(~(np.diff(time) > 0))
+    if len(back):
+        row = back[0] + 1
+        raise InputError(
+            f"{file}: '{clock}' is {time[row]:.9g} in row {row} (from 0) after {time[row - 1]:.9g}; it must increase"
+        )
+    joints, states = (), {}
+    for kind in ("position", "velocity"):
+        if kind in kinds:
+            names, source, _ = _of_joints(table, kinds[kind], model, list(joints) or None, kind)
+            values = _matrix(table, source, names, kind)
+            if len(values) != len(time):
+                raise InputError(f"{file}: {kind} has {len(values)} rows, the command {len(time)}")
+            if not np.isfinite(values).all():
+                row, column = np.argwhere(~np.isfinite(values))[0]
+                raise InputError(f"{file}: {kind} of {names[column]} is no number in row {row} (from 0)")
+            joints, states = names, states | {kind: values}
+    if "position" not in states:
+        joints, states = (), {}
+    return Commands(time, command, joints, **states)
+
+
+def _of_drives(
+    table: Table, columns: Sequence[str], drives: Sequence[str], of: Sequence[str]
+) -> Float[np.ndarray, "samples drives"]:
+    """The commands in the drives' order, by the names of drives or joints, else in the columns' own order."""
+    for names in (drives, of):
+        by_name = {name: c for name in names for c in columns if _holds(c, name, names)}
+        if len(by_name) == len(set(names)):
+            return _matrix(table, [by_name[name] for name in names], drives, "command")
+    whole = len(columns) == 1 and table.read(columns[0]).ndim == 2
+    count = table.read(columns[0]).shape[1] if whole else len(columns)
+    if count != len(drives):
+        raise InputError(
+            f"{table.file}: {count} columns of a command ({', '.join(columns[:12])}), but the model has {len(drives)}"
+            f" drives: {', '.join(drives)}; name one column for each"
+        )
+    return _matrix(table, columns[0] if whole else sorted(columns, key=_number), drives, "command")

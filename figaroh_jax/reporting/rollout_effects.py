@@ -38,7 +38,7 @@ def _said(name: str, number: str, size: float, hidden_by: str, excite: str, said
     )  # fmt: skip
 
 
-_NONE = "no simulator's file: `model/loop.json` holds it, and `fj.rollout` simulates it"
+_NONE = "no simulator's file: `model/loop.json` holds it, and `figaroh-jax simulate` moves it"
 
 ROLLOUT_EFFECTS = {
     "joint_damping": RolloutEffect(

@@ -64,7 +64,7 @@ def described(loop: Loop) -> dict[str, Any]:
     limits = {name: _limits(loop, k) for k, name in enumerate(loop.robot.dof_names)}
     content = {
         "joints": joints, "drives": drives, "limits": limits, "dt": float(loop.dt), "integrator": loop.integrator,
-        "law": loop.law,
+        "law": loop.law, "start": np.asarray(loop.start, float).tolist(),
     }  # fmt: skip
     pairs = [_pair(loop, k) for k in range(0 if loop.pairs is None else len(loop.pairs.at))]
     if pairs := [one for one in pairs if any(one["parameters"].values())]:

@@ -1,0 +1,247 @@
+"""A model of a finished run moved by commands from a file, and what it did as a run directory."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from ..effects.extended import ExtendedModel, require_single_axes
+from ..effects.simulation import simulate as move
+from ..errors import InputError
+from ..formats.export import load_model
+from ..recordings.draft_columns import Commands, read_commands
+from ..reporting.run_directory import check_directory, whole_directory
+from ..rigid.manifold import neutral
+from ..rigid.model import RobotModel
+from ..rollouts.data import Run, Stretch, noise_of, regular, windows
+from ..rollouts.loop import Loop
+from ..rollouts.simulation import rollout
+from ..rollouts.stored import LOOP, read_loop
+from .run import Done, Progress
+
+__all__ = ["SIMULATION", "simulate"]
+
+SIMULATION = "simulation"
+_SLOWEST = 0.02  # s between rows: a file of fewer is a list of set points, and the rows are those of the steps
+_STEP = 1e-3  # s, the longest step of a model of torques
+_MOST = 5_000_000  # steps
+
+
+class _Plan(NamedTuple):
+    """The steps of a simulation: the row of the command that holds in each, and the steps at which rows are written."""
+
+    dt: float
+    row: np.ndarray  # (steps,)
+    part: np.ndarray  # (steps,) how far each step is on the way to the next row, 0 to 1
+    written: np.ndarray  # (rows,)
+
+
+def simulate(
+    model: Path, file: Path, out: Path, progress: Progress, *, interpolate: bool = False, start: str | None = None
+) -> Done:
+    """Move the model of a run by the commands of `file`, held from row to row, and write what it did.
+
+    A model of rollouts takes what its drives are commanded, one of torques the torques of its joints. It starts at the
+    file's first position, where it has positions (of every joint), else at `start`, else at the model's zero; at rest
+    where no velocity is told.
+    Written are `simulation.csv`, `simulation.npz` and `simulation.json`; with positions in the file also how far the
+    motion is from them.
+    """
+    folder = model / "model" if (model / "model" / "effects.yaml").is_file() else model
+    check_directory(out, [folder, file])
+    progress("reading", 0.0)
+    of_rollouts = (folder / LOOP).is_file()
+    moved: Loop | ExtendedModel = read_loop(folder) if of_rollouts else load_model(folder)
+    robot = moved.robot
+    if isinstance(moved, Loop):
+        way = np.abs(np.asarray(moved.drives.transmission))
+        drives, of = moved.drives.names, [robot.dof_names[k] for k in way.argmax(1)]
+    else:
+        require_single_axes(robot, "a simulation of torques")
+        drives, of = robot.dof_names, robot.dof_names
+    given = read_commands(file, drives, of, robot, torque=not of_rollouts)
+    plan = _planned(file, given, float(moved.dt) if isinstance(moved, Loop) else _STEP)
+    position, velocity, begun = _begun(moved, file, given, start)
+    after = np.minimum(plan.row + 1, len(given.time) - 1)
+    command = given.command[plan.row]
+    if interpolate:
+        command = command + plan.part[:, None] * (given.command[after] - command)
+    progress("simulating", 0.2)
+    q, v, read = _moved(moved, command, position, velocity, plan.dt)
+    found = {
+        "time": given.time[0] + plan.dt * plan.written,
+        "position": q[plan.written],
+        "velocity": v[plan.written],
+        "reading": read[plan.written],
+        "command": command[plan.written],
+    }
+    answer = _answer(folder, file, moved, given, plan, found, begun, interpolate)
+    text = json.dumps(answer, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    progress("writing", 1.0)
+    with whole_directory(out, [folder, file]) as work:
+        (work / f"{SIMULATION}.json").write_text(text, encoding="utf-8")
+        np.savez_compressed(work / f"{SIMULATION}.npz", allow_pickle=False, **found)
+        head = ["t", *_names(robot), *(f"v.{name}" for name in robot.dof_names), *(f"u.{name}" for name in drives)]
+        table = np.column_stack([found["time"], found["position"], found["velocity"], found["command"]])
+        np.savetxt(work / f"{SIMULATION}.csv", table, "%.10g", ",", header=",".join(head), comments="")
+    return Done(answer, lambda: text, lambda verbose: print("\n".join(_summary(answer))))
+
+
+def _planned(file: Path, given: Commands, longest: float) -> _Plan:
+    """Steps that divide the period of an even clock; a list of set points is held in steps of the model's own."""
+    time = given.time
+    if len(time) < 2:
+        raise InputError(
+            f"{file}: {len(time)} row of commands; the last one says when the simulation ends, so it takes two"
+        )
+    steps = np.diff(time)
+    even = bool((np.abs(steps - np.median(steps)) <= 0.5 * np.median(steps)).all())
+    if given.position is not None or (even and np.median(steps) <= _SLOWEST):
+        period = regular(str(file), time)
+        many = max(1, int(np.ceil(period / longest - 1e-6)))
+        count = np.arange((len(time) - 1) * many + 1)
+        plan = _Plan(period / many, count // many, count % many / many, count[::many])
+    else:
+        whole = (time[-1] - time[0]) / longest
+        if whole > _MOST:
+            raise InputError(
+                f"{file}: {time[-1] - time[0]:.6g} s are {whole:.3g} steps of {longest:.3g} s; is the time in s?"
+            )
+        count = np.arange(int(np.floor(whole + 1e-6)) + 1)
+        now = time[0] + longest * count
+        row = np.clip(np.searchsorted(time, now + 1e-9 * longest, side="right") - 1, 0, len(time) - 1)
+        ahead = np.append(steps, np.inf)[row]
+        plan = _Plan(longest, row, np.clip((now - time[row]) / ahead, 0.0, 1.0), count)
+    if len(plan.row) > _MOST:
+        raise InputError(
+            f"{file}: {len(plan.row)} steps of {plan.dt:.3g} s; at most {_MOST} are simulated, cut the file"
+        )
+    return plan
+
+
+def _begun(
+    moved: Loop | ExtendedModel, file: Path, given: Commands, start: str | None
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Configuration and velocity at the beginning, and where they come from."""
+    robot = moved.robot
+    q, v = (np.array(moved.start, float) if isinstance(moved, Loop) else neutral(robot)), np.zeros(robot.nv)
+    column = dict(zip(robot.dof_names, range(robot.nv), strict=True))
+    place = {j.name: at.start for j, at in zip(robot.joints, robot.dofs.positions, strict=True) if not j.follows}
+    if start is not None:
+        for name, value in _stated(start, robot).items():
+            q[place[name]] = value
+        return q, v, "--start"
+    if given.position is None:
+        return q, v, "the model's zero"
+    if isinstance(moved, Loop) and given.joints == robot.dof_names:
+        run = Run(file.name, given.time, given.command, given.position, given.velocity)
+        cut = windows(moved, [run], [Stretch(0, 0, len(run.time))], [noise_of(run.position)], 0.3, smooth=True)
+        state = np.asarray(cut.start)[:, 0]
+        return state[: robot.nv], state[robot.nv : 2 * robot.nv], "the first rows of the file"
+    for k, name in enumerate(given.joints):
+        q[place[name]] = given.position[0, k]
+        if given.velocity is not None:
+            v[column[name]] = given.velocity[0, k]
+    return q, v, "the first row of the file"
+
+
+def _stated(start: str, robot: RobotModel) -> dict[str, float]:
+    single = [j.name for j in robot.joints if not j.follows and j.kind in ("revolute", "prismatic")]
+    found: dict[str, float] = {}
+    for part in start.split(","):
+        name, _, value = (text.strip() for text in part.partition("="))
+        try:
+            found[name] = float(value)
+        except ValueError:
+            found[name] = np.nan
+        if name not in single or not np.isfinite(found[name]):
+            raise InputError(
+                f"--start {start}: '{part}' is not JOINT=VALUE (rad or m) of one of the joints {', '.join(single)}"
+            )
+    return found
+
+
+def _moved(
+    moved: Loop | ExtendedModel, command: np.ndarray, q: np.ndarray, v: np.ndarray, dt: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, velocities and readings at every step; `InputError` where the motion diverges."""
+    if isinstance(moved, Loop):
+        done = rollout(eqx.tree_at(lambda m: m.dt, moved, np.float64(dt)), command, q, v)
+        return np.asarray(done.position), np.asarray(done.velocity), np.asarray(done.reading)
+    found = move(moved, command, q, v, dt)
+    speed = np.asarray(found.velocity)
+    lost = np.argwhere(~(np.abs(speed) < 1e6))
+    if len(lost):
+        row, column = lost[0]
+        raise InputError(
+            f"the simulation diverges at joint {moved.robot.dof_names[column]}, {row * dt:.4g} s: torques without a"
+            " controller leave any motion; check their units and where it starts"
+        )
+    return np.asarray(found.position), speed, np.asarray(found.position_read)
+
+
+def _names(robot: RobotModel) -> Sequence[str]:
+    """The numbers of a configuration, as columns are called."""
+    names = [""] * robot.nq
+    for joint, at in zip(robot.joints, robot.dofs.positions, strict=True):
+        many = at.stop - at.start
+        parts = {7: ("x", "y", "z", "qx", "qy", "qz", "qw"), 4: ("qx", "qy", "qz", "qw")}.get(
+            many, tuple(map(str, range(many)))
+        )
+        if not joint.follows:
+            names[at] = [f"q.{joint.name}"] if many == 1 else [f"q.{joint.name}.{part}" for part in parts]
+    return names
+
+
+def _answer(
+    folder: Path,
+    file: Path,
+    moved: Loop | ExtendedModel,
+    given: Commands,
+    plan: _Plan,
+    found: dict[str, np.ndarray],
+    begun: str,
+    interpolate: bool,
+) -> dict[str, Any]:
+    robot, error = moved.robot, None
+    turns = dict(zip(robot.dof_names, robot.dofs.turns[np.argsort(robot.dofs.column)][: robot.nv], strict=True))
+    if given.position is not None:
+        at = [robot.dof_names.index(name) for name in given.joints]
+        rms = np.sqrt(np.mean((found["reading"][:, at] - given.position) ** 2, axis=0))
+        error = {
+            name: {"rms": float(x), "unit": "rad" if turns[name] else "m"}
+            for name, x in zip(given.joints, rms, strict=True)
+        }
+    return {
+        "format": 1,
+        "robot": robot.name,
+        "model": str(folder),
+        "kind": "rollout" if isinstance(moved, Loop) else "torque",
+        "command": str(file),
+        "drives": list(moved.drives.names if isinstance(moved, Loop) else robot.dof_names),
+        "between_rows": "interpolated" if interpolate else "held",
+        "joints": list(robot.dof_names),
+        "start": begun,
+        "step": plan.dt,
+        "steps": len(plan.row),
+        "rows": len(plan.written),
+        "duration": float(found["time"][-1] - found["time"][0]),
+        "error": error,
+    }
+
+
+def _summary(answer: dict[str, Any]) -> list[str]:
+    lines = [
+        f"simulated  {answer['robot']}: {answer['duration']:.4g} s in {answer['steps']} steps of"
+        f" {1e3 * answer['step']:.4g} ms, commands {answer['between_rows']}, from {answer['start']}."
+    ]
+    if answer["error"]:
+        lines += ["", "RMS distance from the file's positions"]
+        width = max(map(len, answer["error"]))
+        lines += [f"{name:<{width}}  {one['rms']:.4g} {one['unit']}" for name, one in answer["error"].items()]
+    return lines

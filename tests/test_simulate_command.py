@@ -1,0 +1,175 @@
+"""`figaroh-jax simulate`: a run's model moved by a file of commands, against MuJoCo C and SciPy."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import mujoco as engine
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from test_rollout_callback import NUMBERS, TWO, changed
+
+import figaroh_jax as fj
+from figaroh_jax.cli import main
+from figaroh_jax.formats.export import write_model
+from figaroh_jax.jobs.rollouts import write_loop
+from figaroh_jax.recordings.reading import read_table
+from figaroh_jax.rollouts.data import Run
+from figaroh_jax.rollouts.loop import Loop
+from figaroh_jax.rollouts.task import extended_of, simulated
+
+mujoco: Any = engine
+PENDULUM = """<robot name="pendulum"><link name="world"/><link name="rod"><inertial><origin xyz="0 0 -.4"/><mass
+value="1.5"/><inertia ixx=".02" iyy=".02" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="hinge"
+type="revolute"><parent link="world"/><child link="rod"/><axis xyz="0 1 0"/><limit lower="-9" upper="9" effort="9"
+velocity="9"/></joint></robot>"""
+STIRRED = TWO.replace(
+    "</actuator>", '<general name="c" joint="j1" dyntype="filter" dynprm=".05" gainprm="3"/></actuator>'
+)
+
+
+def written(folder: Path, text: str = TWO, numbers: dict[str, list[float]] | None = None) -> Loop:
+    """A run's `model` of this arm, and its loop."""
+    folder.mkdir(exist_ok=True)
+    (folder / "arm.xml").write_text(text)
+    loop = changed(fj.load_loop(folder / "arm.xml")[0], numbers or {})
+    write_model(extended_of(loop), folder / "run" / "model")
+    write_loop(folder / "run" / "model", loop)
+    return loop
+
+
+def saved(file: Path, **columns: np.ndarray) -> Path:
+    """A CSV file with a column for each name."""
+    np.savetxt(file, np.column_stack([*columns.values()]), "%.17g", ",", header=",".join(columns), comments="")
+    return file
+
+
+def ran(folder: Path, file: Path, *more: str) -> dict[str, np.ndarray]:
+    run, out = folder / "run", folder / "out"
+    assert main(["simulate", str(run), "--command", str(file), "--out", str(out), "--quiet", *more]) == 0
+    with np.load(out / "simulation.npz") as found:
+        return dict(found)
+
+
+def refused(capsys: pytest.CaptureFixture[str], folder: Path, file: Path, *more: str) -> str:
+    """The message of a wrong input, after which nothing is there."""
+    out = folder / "refused"
+    assert main(["simulate", str(folder / "run"), "--command", str(file), "--out", str(out), "--quiet", *more]) == 2
+    assert not out.exists()
+    return capsys.readouterr().err
+
+
+def in_mujoco(file: Path, command: np.ndarray, start: tuple[float, ...] = (0.0, 0.0)) -> np.ndarray:
+    """Positions before each step of MuJoCo C with the exported `robot.xml`."""
+    model = mujoco.MjModel.from_xml_path(str(file))
+    data, seen = mujoco.MjData(model), []
+    data.qpos[:] = start
+    for row in command:
+        data.ctrl[:] = row
+        seen.append(data.qpos.copy())
+        mujoco.mj_step(model, data)
+    return np.array(seen)
+
+
+def test_a_recording_of_commands_moves_the_arm_as_mujoco_moves_it(tmp_path: Path):
+    """Columns in another order than the drives, five steps to a row."""
+    written(tmp_path)
+    t = 0.01 * np.arange(300)
+    u = 0.4 * np.sin(t[:, None] * [4.0, 7.0] + [0.0, 1.0])
+    file = saved(tmp_path / "commands.csv", time=t + 17.0, cmd_b=u[:, 1], cmd_a=u[:, 0])
+    found = ran(tmp_path, file)
+    theirs = in_mujoco(tmp_path / "run" / "model" / "robot.xml", np.repeat(u, 5, 0))[::5]
+    np.testing.assert_allclose(found["time"], t + 17.0, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found["position"], theirs, rtol=0, atol=1e-7)
+    assert np.ptp(theirs, axis=0).min() > 0.3
+    table = read_table(tmp_path / "out" / "simulation.csv", "motion")
+    np.testing.assert_allclose(table.vector("q.j2", "q"), found["position"][:, 1], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("interpolate", [False, True])
+def test_set_points_at_uneven_times_are_held_or_joined_by_lines(interpolate: bool, tmp_path: Path):
+    written(tmp_path)
+    t, u = np.array([0.0, 0.5, 0.6, 1.7]), np.array([[0.0, 0.1], [0.5, -0.2], [0.1, 0.4], [-0.3, 0.0]])
+    file = saved(tmp_path / "points.csv", t=t, j1=u[:, 0], j2=u[:, 1])
+    found = ran(tmp_path, file, "--start", "j2=-0.3", *(["--interpolate"] if interpolate else []))
+    now = 0.002 * np.arange(851)
+    held = u[np.searchsorted(t, now + 1e-9, side="right") - 1]
+    lines = np.column_stack([np.interp(now, t, column) for column in u.T])
+    theirs = in_mujoco(tmp_path / "run" / "model" / "robot.xml", lines if interpolate else held, (0.0, -0.3))
+    np.testing.assert_allclose(found["position"], theirs, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(found["time"], now, rtol=0, atol=1e-9)
+
+
+def test_a_recording_starts_where_it_started_and_is_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """As the held-out predictions of a run are: the same function gives the same motion, and its error is told."""
+    loop = written(tmp_path, numbers=NUMBERS["all"])
+    t = 0.01 * np.arange(200)
+    u = 0.4 * np.sin(t[:, None] * [4.0, 7.0] + [0.0, 1.0])
+    with jax.enable_x64(True):
+        seen = np.asarray(fj.rollout(loop, np.repeat(u, 5, 0), np.array([0.1, -0.2])).reading)[::5] + 0.002
+    names = [("cmd_j1", u[:, 0]), ("cmd_j2", u[:, 1]), ("pos_j1", seen[:, 0]), ("pos_j2", seen[:, 1])]
+    file = saved(tmp_path / "recording.csv", time=t, **dict(names))
+    found = ran(tmp_path, file, "--json")
+    answer = json.loads(capsys.readouterr().out)
+    wanted = simulated(loop, Run("recording", t, u, seen, None))
+    np.testing.assert_allclose(found["reading"], wanted, rtol=0, atol=1e-9)
+    error = np.sqrt(np.mean((wanted - seen) ** 2, axis=0))
+    np.testing.assert_allclose([answer["error"][j]["rms"] for j in ("j1", "j2")], error, rtol=1e-6)
+
+
+@pytest.mark.parametrize("text", [TWO, STIRRED])
+def test_every_number_of_a_loop_is_read_back(text: str, tmp_path: Path):
+    loop = written(tmp_path, text, NUMBERS["friction"] | NUMBERS["torques"])
+    again = fj.read_loop(tmp_path / "run" / "model")
+    for part in ("joints", "drives"):
+        for name, value in vars(getattr(loop, part)).items():
+            if name in ("names", "activation", "early"):
+                assert getattr(getattr(again, part), name) == value, name
+            else:
+                np.testing.assert_array_equal(getattr(getattr(again, part), name), value, err_msg=name)
+    assert (again.dt, again.integrator, again.law, again.limited) == (loop.dt, loop.integrator, loop.law, loop.limited)
+    np.testing.assert_allclose(again.robot.inertia, loop.robot.inertia, rtol=0, atol=1e-12)
+
+
+def test_torques_move_a_damped_pendulum_as_its_equation_says(tmp_path: Path):
+    """SciPy integrates the equation of motion; the model's steps of 1 ms are of first order."""
+    (tmp_path / "pendulum.urdf").write_text(PENDULUM)
+    with jax.enable_x64(True):
+        robot = fj.load_urdf(tmp_path / "pendulum.urdf")
+        damped = fj.extend(robot, fj.place(fj.CATALOGUE["viscous_friction"], robot, ["hinge"], damping=0.2))
+        write_model(damped, tmp_path / "run" / "model")
+    t = 0.005 * np.arange(400)
+    file = saved(tmp_path / "torques.csv", t=t, tau=np.sin(3 * t))
+    found = ran(tmp_path, file, "--start", "hinge=0.7", "--interpolate")
+    inertia, weight = 0.02 + 1.5 * 0.4**2, 1.5 * 9.81 * 0.4
+
+    def law(time: float, x: np.ndarray) -> list[float]:
+        return [x[1], (np.sin(3 * time) - weight * np.sin(x[0]) - 0.2 * x[1]) / inertia]
+
+    wanted = solve_ivp(law, (0, t[-1]), [0.7, 0.0], t_eval=t, rtol=1e-9, atol=1e-9).y[0]
+    np.testing.assert_allclose(found["position"][:, 0], wanted, rtol=0, atol=4e-3)
+    assert np.ptp(wanted) > 0.8
+
+
+def test_wrong_files_are_told_and_nothing_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    written(tmp_path)
+    t, zero = 0.01 * np.arange(50), np.zeros(50)
+    assert "no column looks like a command" in refused(capsys, tmp_path, saved(tmp_path / "1.csv", t=t, x=zero))
+    one = saved(tmp_path / "2.csv", t=t, cmd=zero)
+    assert "1 columns of a command (cmd), but the model has 2 drives: a, b" in refused(capsys, tmp_path, one)
+    back = saved(tmp_path / "3.csv", t=np.where(np.arange(50) == 20, 0.1, t), cmd_a=zero, cmd_b=zero)
+    assert "in row 20 (from 0)" in refused(capsys, tmp_path, back)
+    good = saved(tmp_path / "4.csv", t=t, cmd_a=zero, cmd_b=zero)
+    assert "not JOINT=VALUE" in refused(capsys, tmp_path, good, "--start", "j9=1")
+    assert "does not exist" in refused(capsys, tmp_path, tmp_path / "none.csv")
+    late = saved(tmp_path / "5.csv", t=t + 0.5 * (t > 0.3), cmd_a=zero, cmd_b=zero, pos_j1=zero, pos_j2=zero)
+    assert "the time stamp jumps in row 31" in refused(capsys, tmp_path, late)
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "thesis.txt").write_text("mine")
+    out = ["--out", str(tmp_path / "own"), "--quiet"]
+    assert main(["simulate", str(tmp_path / "run"), "--command", str(good), *out]) == 2
+    assert (tmp_path / "own" / "thesis.txt").read_text() == "mine"
+    (tmp_path / "run" / "model" / "loop.json").write_text("{}")
+    assert "the key 'joints' is missing" in refused(capsys, tmp_path, good)
