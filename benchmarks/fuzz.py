@@ -186,15 +186,15 @@ class Bench:
         """Two finished runs, with the files that the commands on runs read."""
         from test_run_tools import ANSWER, CALIBRATION, RESULT, run
 
-        from figaroh_jax.jobs.rollouts import write_loop
         from figaroh_jax.rollouts.reading import load_loop
+        from figaroh_jax.rollouts.stored import add_loop
 
         for name in ("first", "second"):
             run(self.folder / "runs" / name, self.folder / "task.yaml", answer=ANSWER, result=RESULT)
         loop_folder = self.folder / "loop"
         loop_folder.mkdir()
         shutil.copy(self.folder / "arm.xml", loop_folder / "robot.xml")
-        write_loop(loop_folder, load_loop(self.folder / "arm.xml")[0])
+        add_loop(loop_folder, load_loop(self.folder / "arm.xml")[0])
         first = self.folder / "runs" / "first"
         self.run_files: dict[str, Any] = {
             "answer.json": json.dumps(ANSWER, indent=1),

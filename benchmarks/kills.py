@@ -119,12 +119,12 @@ def prepare(folder: Path) -> None:
     (folder.parent / "found.pickle").write_bytes(pickle.dumps(found))
     from generators import servo_arm
 
-    from figaroh_jax.jobs.rollouts import write_loop
     from figaroh_jax.rollouts.reading import load_loop
+    from figaroh_jax.rollouts.stored import add_loop
 
     (folder / "loop").mkdir()
     (folder / "loop" / "robot.xml").write_text(servo_arm.model_text())
-    write_loop(folder / "loop", load_loop(folder / "loop" / "robot.xml")[0])
+    add_loop(folder / "loop", load_loop(folder / "loop" / "robot.xml")[0])
     _right_recording(folder / "run1.npz", found["diagnose"].model)
     (folder / "runs").mkdir()
     os.chdir(folder)

@@ -105,7 +105,7 @@ if TYPE_CHECKING:
     from .rollouts.measured import RolloutData as RolloutData, rollout_data as rollout_data
     from .rollouts.reading import load_loop as load_loop
     from .rollouts.simulation import rollout as rollout
-    from .rollouts.stored import read_loop as read_loop
+    from .rollouts.stored import read_loop as read_loop, write_loop as write_loop
     from .simulators.registry import backend as backend
     from .tasks import diagnose as diagnose, diagnose_task as diagnose_task, identify_task as identify_task
 
@@ -143,7 +143,7 @@ _MODULES = {
     "identification.identification": ("identify",),
     "rollouts.measured": ("RolloutData", "rollout_data"),
     "rollouts.reading": ("load_loop",),
-    "rollouts.stored": ("read_loop",),
+    "rollouts.stored": ("read_loop", "write_loop"),
     "rollouts.simulation": ("rollout",),
     "rigid.kinematics": ("forward_kinematics", "frame_jacobian", "frame_placement"),
     "formats.mjcf": ("load_mjcf",),

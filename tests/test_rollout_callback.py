@@ -11,10 +11,10 @@ import pytest
 
 from figaroh_jax.formats.export import write_model
 from figaroh_jax.jobs.export import export_loop
-from figaroh_jax.jobs.rollouts import write_loop
 from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.simulation import rollout
+from figaroh_jax.rollouts.stored import add_loop
 from figaroh_jax.rollouts.task import extended_of
 
 mujoco: Any = engine
@@ -46,7 +46,7 @@ def test_the_exported_callback_moves_mujoco_as_the_loop_moves(which: str, tmp_pa
     (tmp_path / "arm.xml").write_text(TWO)
     loop = changed(load_loop(tmp_path / "arm.xml")[0], NUMBERS[which])
     write_model(extended_of(loop), tmp_path / "model")
-    write_loop(tmp_path / "model", loop)
+    add_loop(tmp_path / "model", loop)
     export_loop(tmp_path / "model", "mujoco", tmp_path / "out")
     spec = importlib.util.spec_from_file_location("callback", tmp_path / "out" / "callback.py")
     assert spec is not None and spec.loader is not None
@@ -68,7 +68,7 @@ def test_a_drive_with_a_state_is_refused(tmp_path: Path):
     (tmp_path / "arm.xml").write_text(TWO.replace('<position name="a"', '<position timeconst=".05" name="a"'))
     loop = changed(load_loop(tmp_path / "arm.xml")[0], {"dead_band": [0.01, 0.0]})
     write_model(extended_of(loop), tmp_path / "model")
-    write_loop(tmp_path / "model", loop)
+    add_loop(tmp_path / "model", loop)
     export_loop(tmp_path / "model", "mujoco", tmp_path / "out")
     from figaroh_jax.rollouts.callback import Rest
 

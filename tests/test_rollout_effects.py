@@ -16,7 +16,6 @@ from generators import servo_arm6
 
 import figaroh_jax as fj
 from figaroh_jax.formats.export import write_model
-from figaroh_jax.jobs.rollouts import write_loop
 from figaroh_jax.rollouts import sensitivity
 from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.data import Run, Stretch, windows
@@ -27,6 +26,7 @@ from figaroh_jax.rollouts.parameters import Entry, put, values
 from figaroh_jax.rollouts.search import search
 from figaroh_jax.rollouts.sensitivity import linear_sums
 from figaroh_jax.rollouts.setting import setting
+from figaroh_jax.rollouts.stored import add_loop
 from figaroh_jax.rollouts.task import extended_of
 
 mujoco: Any = engine
@@ -108,7 +108,7 @@ def test_what_was_found_moves_mujoco_as_it_moves_us(tmp_path: Path):
         loop = put(loop, table, np.array([0.2, -0.1, 9.0, 0.7]))
     folder = tmp_path / "model"
     write_model(extended_of(loop), folder)
-    write_loop(folder, loop)
+    add_loop(folder, loop)
     callback = Path(sensitivity.__file__).with_name("callback.py")
     spec = importlib.util.spec_from_file_location("callback", callback)
     assert spec is not None and spec.loader is not None

@@ -22,7 +22,6 @@ from figaroh_jax.cli import main
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.export import write_model
 from figaroh_jax.jobs.export import export_loop
-from figaroh_jax.jobs.rollouts import write_loop
 from figaroh_jax.results import Gain
 from figaroh_jax.rollouts.alone import separable
 from figaroh_jax.rollouts.data import Run, ahead_of_command
@@ -31,6 +30,7 @@ from figaroh_jax.rollouts.gates import rms_of
 from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.simulation import rollout
+from figaroh_jax.rollouts.stored import add_loop
 from figaroh_jax.rollouts.task import _gain as gain_of, extended_of
 
 mujoco: Any = engine
@@ -162,7 +162,7 @@ def test_what_is_exported_moves_in_mujoco_as_the_users_own_file(which: str, tmp_
     (tmp_path / "arm.xml").write_text(source)
     loop, _ = load_loop(tmp_path / "arm.xml")
     write_model(extended_of(loop), tmp_path / "model")
-    write_loop(tmp_path / "model", loop)
+    add_loop(tmp_path / "model", loop)
     export_loop(tmp_path / "model", "mujoco", tmp_path / "out")
     texts = [(tmp_path / "arm.xml"), (tmp_path / "out" / "robot.xml")]
     both, t = [], 0.002 * np.arange(1000)

@@ -14,10 +14,10 @@ from test_rollout_callback import NUMBERS, TWO, changed
 import figaroh_jax as fj
 from figaroh_jax.cli import main
 from figaroh_jax.formats.export import write_model
-from figaroh_jax.jobs.rollouts import write_loop
 from figaroh_jax.recordings.reading import read_table
 from figaroh_jax.rollouts.data import Run
 from figaroh_jax.rollouts.loop import Loop
+from figaroh_jax.rollouts.stored import add_loop
 from figaroh_jax.rollouts.task import extended_of, simulated
 
 mujoco: Any = engine
@@ -36,7 +36,7 @@ def written(folder: Path, text: str = TWO, numbers: dict[str, list[float]] | Non
     (folder / "arm.xml").write_text(text)
     loop = changed(fj.load_loop(folder / "arm.xml")[0], numbers or {})
     write_model(extended_of(loop), folder / "run" / "model")
-    write_loop(folder / "run" / "model", loop)
+    add_loop(folder / "run" / "model", loop)
     return loop
 
 

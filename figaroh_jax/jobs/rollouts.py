@@ -10,14 +10,12 @@ from ..reporting.answer import to_json, write_predictions
 from ..reporting.report import write_report
 from ..reporting.rollout_report import show_rollouts, write_rollouts
 from ..reporting.terminal import show
-from ..rollouts.export import described, described_text, with_drives
 from ..rollouts.identification import identify_rollout_task
-from ..rollouts.loop import Loop
+from ..rollouts.stored import add_loop
 from ..rollouts.task import diagnose_rollout_task
-from .export import LOOP
 from .run import ANSWER, REPORT, RESULT, Done, Progress, run_folder
 
-__all__ = ["diagnose", "identify", "write_loop"]
+__all__ = ["diagnose", "identify"]
 
 
 def diagnose(task: Task, out: Path, progress: Progress) -> Done:
@@ -30,7 +28,7 @@ def diagnose(task: Task, out: Path, progress: Progress) -> Done:
         write_predictions(folder / "predictions.npz", done.predictions, "position")
         write_report(found, folder / REPORT, name)
         write_model(found.model, folder / "model", found.causes)
-        write_loop(folder / "model", done.loop)
+        add_loop(folder / "model", done.loop)
     return Done(found, lambda: to_json(found), lambda verbose: show(found, name, verbose=verbose))
 
 
@@ -44,12 +42,5 @@ def identify(task: Task, out: Path, progress: Progress) -> Done:
         write_rollouts(found, folder / REPORT, name)
         write_predictions(folder / "predictions.npz", found.predictions, "position")
         write_model(found.model, folder / "model")
-        write_loop(folder / "model", found.loop)
+        add_loop(folder / "model", found.loop)
     return Done(found, found.to_json, lambda verbose: show_rollouts(found, name, verbose=verbose))
-
-
-def write_loop(folder: Path, loop: Loop) -> None:
-    """`loop.json`, every number of the loop, and the drives in `robot.xml`."""
-    (folder / LOOP).write_text(described_text(loop), encoding="utf-8")
-    mjcf = folder / "robot.xml"
-    mjcf.write_text(with_drives(mjcf, described(loop)), encoding="utf-8")

@@ -61,10 +61,11 @@ def simulate(
     if isinstance(moved, Loop):
         way = np.abs(np.asarray(moved.drives.transmission))
         drives, of = moved.drives.names, [robot.dof_names[k] for k in way.argmax(1)]
+        torque = not np.asarray(moved.drives.bias)[:, 1:].any()  # motors, whose command is one
     else:
         require_single_axes(robot, "a simulation of torques")
-        drives, of = robot.dof_names, robot.dof_names
-    given = read_commands(file, drives, of, robot, torque=not of_rollouts)
+        drives, of, torque = robot.dof_names, robot.dof_names, True
+    given = read_commands(file, drives, of, robot, torque=torque)
     plan = _planned(file, given, float(moved.dt) if isinstance(moved, Loop) else _STEP)
     position, velocity, begun = _begun(moved, file, given, start)
     after = np.minimum(plan.row + 1, len(given.time) - 1)

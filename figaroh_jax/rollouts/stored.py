@@ -12,15 +12,41 @@ import numpy as np
 from ..effects.base import Effect, place
 from ..effects.registry import find
 from ..errors import InputError
-from ..formats.export import load_model
+from ..formats.export import load_model, write_model
 from ..rigid.manifold import neutral
 from ..rigid.model import RobotModel
+from .export import described, described_text, with_drives
 from .loop import Drives, Joints, Loop, Pairs
 from .reading import plain_joints
+from .task import extended_of
 
-__all__ = ["LOOP", "read_loop"]
+__all__ = ["LOOP", "add_loop", "read_loop", "write_loop"]
 
 LOOP = "loop.json"
+
+
+def write_loop(loop: Loop, directory: str | Path) -> None:
+    """Write the model of a loop into `directory`, as a run does: robot, effects, `loop.json`, drives in `robot.xml`.
+
+    It is what `read_loop`, `figaroh-jax simulate` and `figaroh-jax export` read.
+
+    >>> import tempfile, figaroh_jax as fj
+    >>> from pathlib import Path
+    >>> loop, _ = fj.load_loop(fj.DEMO, {"elbow": {"kind": "position", "kp": 20.0, "kd": 0.5}}, joints=["elbow"])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     fj.write_loop(loop, folder)
+    ...     sorted(file.name for file in Path(folder).iterdir())
+    ['effects.yaml', 'loop.json', 'robot.urdf', 'robot.xml']
+    """
+    write_model(extended_of(loop), directory)
+    add_loop(Path(directory), loop)
+
+
+def add_loop(folder: Path, loop: Loop) -> None:
+    """`loop.json`, every number of the loop, and the drives in the `robot.xml` of a model that is written."""
+    (folder / LOOP).write_text(described_text(loop), encoding="utf-8")
+    mjcf = folder / "robot.xml"
+    mjcf.write_text(with_drives(mjcf, described(loop)), encoding="utf-8")
 
 
 def read_loop(folder: str | Path) -> Loop:
@@ -29,13 +55,10 @@ def read_loop(folder: str | Path) -> Loop:
     Effects of your own must have been registered (`register`) before. Raises `InputError` for a folder without such a
     loop, and for joints, drives or effects that the robot does not have.
 
-    >>> import tempfile, numpy as np, figaroh_jax as fj
-    >>> from figaroh_jax.jobs.rollouts import write_loop
-    >>> drives = {"elbow": {"kind": "position", "kp": 20.0, "kd": 0.5}}
-    >>> loop, _ = fj.load_loop(fj.DEMO, drives, joints=["elbow"])
+    >>> import tempfile, figaroh_jax as fj
+    >>> loop, _ = fj.load_loop(fj.DEMO, {"elbow": {"kind": "position", "kp": 20.0, "kd": 0.5}}, joints=["elbow"])
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     fj.write_model(fj.extend(loop.robot), folder)
-    ...     write_loop(Path(folder), loop)
+    ...     fj.write_loop(loop, folder)
     ...     fj.read_loop(folder).drives.names
     ('elbow',)
     """
