@@ -186,7 +186,9 @@ def _simulate(args: argparse.Namespace) -> int:
     folder = args.task.resolve()
     out = args.out or Path(f"{(folder.parent if folder.name == 'model' else folder).name}_simulation")
     with terminal.Progress(quiet=args.quiet) as progress:
-        done = simulate(args.task, args.file, out, progress, interpolate=args.interpolate, start=args.start)
+        columns = args.columns.split(",") if args.columns else ()
+        own = {"interpolate": args.interpolate, "start": args.start, "columns": columns}
+        done = simulate(args.task, args.file, out, progress, **own)
     with _standard_output():
         if args.json:
             sys.stdout.write(done.to_json())
@@ -304,6 +306,7 @@ def _parser() -> argparse.ArgumentParser:
     moved = commands.add_parser("simulate", help="move a run's model by the commands of a file")
     moved.add_argument("task", type=Path, metavar="MODEL_DIR", help="a run directory, or its `model`")
     moved.add_argument("--command", dest="file", type=Path, required=True, metavar="FILE", help="time and commands")
+    moved.add_argument("--columns", metavar="NAME,...", help="columns of the commands, or their one array")
     moved.add_argument("--interpolate", action="store_true", help="join the rows by lines instead of holding each")
     moved.add_argument("--start", metavar="JOINT=VALUE,...", help="where it starts (rad, m), if FILE has no positions")
     moved.add_argument("--out", type=Path, metavar="DIR", help="run directory; an earlier run there is replaced")

@@ -141,8 +141,8 @@ def test_torques_move_a_damped_pendulum_as_its_equation_says(tmp_path: Path):
         damped = fj.extend(robot, fj.place(fj.CATALOGUE["viscous_friction"], robot, ["hinge"], damping=0.2))
         write_model(damped, tmp_path / "run" / "model")
     t = 0.005 * np.arange(400)
-    file = saved(tmp_path / "torques.csv", t=t, tau=np.sin(3 * t))
-    found = ran(tmp_path, file, "--start", "hinge=0.7", "--interpolate")
+    file = saved(tmp_path / "torques.csv", t=t, tau=np.sin(3 * t), tau_cmd=5 * np.cos(t))
+    found = ran(tmp_path, file, "--start", "hinge=0.7", "--interpolate", "--columns", "tau")
     inertia, weight = 0.02 + 1.5 * 0.4**2, 1.5 * 9.81 * 0.4
 
     def law(time: float, x: np.ndarray) -> list[float]:
@@ -161,6 +161,7 @@ def test_wrong_files_are_told_and_nothing_is_written(tmp_path: Path, capsys: pyt
     assert "1 columns of a command (cmd), but the model has 2 drives: a, b" in refused(capsys, tmp_path, one)
     back = saved(tmp_path / "3.csv", t=np.where(np.arange(50) == 20, 0.1, t), cmd_a=zero, cmd_b=zero)
     assert "in row 20 (from 0)" in refused(capsys, tmp_path, back)
+    assert "no column 'tau_x'" in refused(capsys, tmp_path, one, "--columns", "tau_x")
     good = saved(tmp_path / "4.csv", t=t, cmd_a=zero, cmd_b=zero)
     assert "not JOINT=VALUE" in refused(capsys, tmp_path, good, "--start", "j9=1")
     assert "does not exist" in refused(capsys, tmp_path, tmp_path / "none.csv")

@@ -42,7 +42,14 @@ class _Plan(NamedTuple):
 
 
 def simulate(
-    model: Path, file: Path, out: Path, progress: Progress, *, interpolate: bool = False, start: str | None = None
+    model: Path,
+    file: Path,
+    out: Path,
+    progress: Progress,
+    *,
+    interpolate: bool = False,
+    start: str | None = None,
+    columns: Sequence[str] = (),
 ) -> Done:
     """Move the model of a run by the commands of `file`, held from row to row, and write what it did.
 
@@ -65,7 +72,7 @@ def simulate(
     else:
         require_single_axes(robot, "a simulation of torques")
         drives, of, torque = robot.dof_names, robot.dof_names, True
-    given = read_commands(file, drives, of, robot, torque=torque)
+    given = read_commands(file, drives, of, robot, torque=torque, columns=columns)
     plan = _planned(file, given, float(moved.dt) if isinstance(moved, Loop) else _STEP)
     position, velocity, begun = _begun(moved, file, given, start)
     after = np.minimum(plan.row + 1, len(given.time) - 1)
@@ -224,6 +231,7 @@ def _answer(
         "model": str(folder),
         "kind": "rollout" if isinstance(moved, Loop) else "torque",
         "command": str(file),
+        "columns": list(given.columns),
         "drives": list(moved.drives.names if isinstance(moved, Loop) else robot.dof_names),
         "between_rows": "interpolated" if interpolate else "held",
         "joints": list(robot.dof_names),
@@ -239,7 +247,8 @@ def _answer(
 def _summary(answer: dict[str, Any]) -> list[str]:
     lines = [
         f"simulated  {answer['robot']}: {answer['duration']:.4g} s in {answer['steps']} steps of"
-        f" {1e3 * answer['step']:.4g} ms, commands {answer['between_rows']}, from {answer['start']}."
+        f" {1e3 * answer['step']:.4g} ms, commands ({', '.join(answer['columns'])})"
+        f" {answer['between_rows']}, from {answer['start']}."
     ]
     if answer["error"]:
         lines += ["", "RMS distance from the file's positions"]

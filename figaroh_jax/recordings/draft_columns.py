@@ -420,23 +420,35 @@ class Commands(NamedTuple):
 
     time: Float[np.ndarray, " samples"]  # s
     command: Float[np.ndarray, "samples drives"]
+    columns: tuple[str, ...]  # of the command
     joints: tuple[str, ...] = ()  # of position and velocity
     position: Float[np.ndarray, "samples joints"] | None = None
     velocity: Float[np.ndarray, "samples joints"] | None = None
 
 
-def read_commands(file: Path, drives: Sequence[str], of: Sequence[str], model: RobotModel, *, torque: bool) -> Commands:
+def read_commands(
+    file: Path,
+    drives: Sequence[str],
+    of: Sequence[str],
+    model: RobotModel,
+    *,
+    torque: bool,
+    columns: Sequence[str] = (),
+) -> Commands:
     """Time, commands and, where they are there, positions and velocities of a file, told by the names of its columns.
 
     A column is of the drive whose name it holds, or of the joint that the drive moves (`of`); columns without such
-    names are taken in the drives' order. `torque`: the command is a torque, and columns called so are it. Raises
-    `InputError` with the columns of the file where they do not decide.
+    names are taken in the drives' order. `torque`: the command is a torque, and columns called so are it. `columns`
+    states them (or the one array). Raises `InputError` with the columns of the file where they do not decide.
     """
     table = read_table(file, "recording")
     clock = _time(table)
     kinds = _kinds(table, clock)
     wanted = ["command", *(["torque"] if torque else [])]
-    found = next((kinds[kind] for kind in wanted if kind in kinds), None)
+    unknown = next((name for name in columns if name not in table.names), None)
+    if unknown is not None:
+        raise InputError(f"{file}: no column '{unknown}'; its columns are {', '.join(table.names[:12])}")
+    found = [*columns] or next((kinds[kind] for kind in wanted if kind in kinds), None)
     found = found or [n for n in table.names if n in ("u", "ctrl") or re.fullmatch(r"(u|ctrl)[._\[]*\d+\]?", n)]
     claimed = {name for names in kinds.values() for name in names} | {clock}
     found = found or [n for n in table.names if n not in claimed and (_holds_any(n, drives) or _holds_any(n, of))]
@@ -469,7 +481,7 @@ def read_commands(file: Path, drives: Sequence[str], of: Sequence[str], model: R
             joints, states = names, states | {kind: values}
     if "position" not in states:
         joints, states = (), {}
-    return Commands(time, command, joints, **states)
+    return Commands(time, command, tuple(found), joints, **states)
 
 
 def _of_drives(
