@@ -107,7 +107,7 @@ OTHERS = frozenset(
     " register shape torque_data write_model write_report"
     " Design Instrument Learned PostureDesign Trajectory excite excite_postures excite_task fourier learn limits_of"
     " quintic screen_fleet spline"
-    " JointEffect Load PoseRecording RolloutData Selection load_loop rollout_data select".split()
+    " JointEffect Load PoseRecording RolloutData Selection load_loop read_loop rollout_data select write_loop".split()
 ) | {"rollout"}  # its gradients stand in test_rollouts and test_rollout_data
 
 

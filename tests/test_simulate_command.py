@@ -8,6 +8,7 @@ import jax
 import mujoco as engine
 import numpy as np
 import pytest
+from schema import matches
 from scipy.integrate import solve_ivp
 from test_rollout_callback import NUMBERS, TWO, changed
 
@@ -113,6 +114,7 @@ def test_a_recording_starts_where_it_started_and_is_compared(tmp_path: Path, cap
     file = saved(tmp_path / "recording.csv", time=t, **dict(names))
     found = ran(tmp_path, file, "--json")
     answer = json.loads(capsys.readouterr().out)
+    matches("simulate", answer)
     wanted = simulated(loop, Run("recording", t, u, seen, None))
     np.testing.assert_allclose(found["reading"], wanted, rtol=0, atol=1e-9)
     error = np.sqrt(np.mean((wanted - seen) ** 2, axis=0))
