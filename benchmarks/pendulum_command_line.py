@@ -3,8 +3,9 @@ out.
 
     python benchmarks/pendulum_command_line.py diagnose|identify --out DIR [--window 0.3]
 
-It prints what the command prints, CPU seconds, and what the set's own identified parameters (about the joints) say that
-its URDF has too much of, for the file states them as about the centres of mass.
+It prints what the command prints, CPU seconds, and what the set's own identified parameters (about the joints) say
+that its URDF has too much of, for the file states them as about the centres of mass. After `identify` also how far
+`figaroh-jax simulate` of a recording kept out is from the run's own prediction.
 """
 
 from __future__ import annotations
@@ -48,11 +49,22 @@ def main() -> None:
     status = command_line([args.job, str(args.out / "task.yaml"), "--out", str(args.out / "run"), "--quiet"])
     used = resource.getrusage(resource.RUSAGE_SELF)
     print(f"exit status {status}, {used.ru_utime + used.ru_stime:.0f} CPU s with imports")
+    if args.job == "identify":
+        _simulated(args.out, next(Path(d["file"]) for d in data if d["role"] == "holdout"))
     robot = fj.load_urdf(SET / "double_pendulum_C1.urdf")
     told = yaml.safe_load(next(SET.glob("ref_*.yml")).read_text())
     for k, (name, ten) in enumerate(zip(robot.link_names, np.asarray(robot.inertia), strict=True)):
         print(f"{name}: ixx about the joint by the file {ten[4]:.4f}, by ref_*.yml {told[f'I{k + 1}']:.4f} kg m2:"
               f" {told[f'I{k + 1}'] - ten[4]:+.4f}")  # fmt: skip
+
+
+def _simulated(out: Path, file: Path) -> None:
+    """What `simulate` makes of a recording kept out, beside the run's own prediction; its clock is that file's own."""
+    own = ["--columns", "tau", "--out", str(out / "moved"), "--quiet"]
+    command_line(["simulate", str(out / "run"), "--command", str(file), *own])
+    moved, told = np.load(out / "moved" / "simulation.npz"), np.load(out / "run" / "predictions.npz")
+    apart = np.abs(moved["reading"] - told[f"{file.stem}_position"]).max()
+    print(f"{file.name}: at most {1e3 * apart:.2g} mrad from the run's prediction")
 
 
 if __name__ == "__main__":

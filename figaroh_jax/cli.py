@@ -308,7 +308,7 @@ def _parser() -> argparse.ArgumentParser:
     moved.add_argument("--command", dest="file", type=Path, required=True, metavar="FILE", help="time and commands")
     moved.add_argument("--columns", metavar="NAME,...", help="columns of the commands, or their one array")
     moved.add_argument("--interpolate", action="store_true", help="join the rows by lines instead of holding each")
-    moved.add_argument("--start", metavar="JOINT=VALUE,...", help="where it starts (rad, m), if FILE has no positions")
+    moved.add_argument("--start", metavar="JOINT=VALUE,...", help="start (rad, m) in place of FILE's positions")
     moved.add_argument("--out", type=Path, metavar="DIR", help="run directory; an earlier run there is replaced")
     moved.add_argument("--json", action="store_true", help="print the answer as JSON instead of the summary")
     moved.add_argument("--quiet", action="store_true", help="no progress on standard error")

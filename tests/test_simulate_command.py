@@ -106,10 +106,11 @@ def test_set_points_at_uneven_times_are_held_or_joined_by_lines(interpolate: boo
 def test_a_recording_starts_where_it_started_and_is_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """As the held-out predictions of a run are: the same function gives the same motion, and its error is told."""
     loop = written(tmp_path, numbers=NUMBERS["all"])
-    t = 0.01 * np.arange(200)
+    t = 0.01 * np.arange(260)
     u = 0.4 * np.sin(t[:, None] * [4.0, 7.0] + [0.0, 1.0])
     with jax.enable_x64(True):
         seen = np.asarray(fj.rollout(loop, np.repeat(u, 5, 0), np.array([0.1, -0.2])).reading)[::5] + 0.002
+    t, u, seen = t[60:], u[60:], seen[60:]  # on the move
     names = [("cmd_j1", u[:, 0]), ("cmd_j2", u[:, 1]), ("pos_j1", seen[:, 0]), ("pos_j2", seen[:, 1])]
     file = saved(tmp_path / "recording.csv", time=t, **dict(names))
     found = ran(tmp_path, file, "--json")
@@ -117,6 +118,7 @@ def test_a_recording_starts_where_it_started_and_is_compared(tmp_path: Path, cap
     matches("simulate", answer)
     wanted = simulated(loop, Run("recording", t, u, seen, None))
     np.testing.assert_allclose(found["reading"], wanted, rtol=0, atol=1e-9)
+    assert np.abs(found["reading"] - seen).max() < 0.01  # the start is found, and the command holds it near
     error = np.sqrt(np.mean((wanted - seen) ** 2, axis=0))
     np.testing.assert_allclose([answer["error"][j]["rms"] for j in ("j1", "j2")], error, rtol=1e-6)
 
@@ -144,7 +146,7 @@ def test_torques_move_a_damped_pendulum_as_its_equation_says(tmp_path: Path):
         write_model(damped, tmp_path / "run" / "model")
     t = 0.005 * np.arange(400)
     file = saved(tmp_path / "torques.csv", t=t, tau=np.sin(3 * t), tau_cmd=5 * np.cos(t))
-    found = ran(tmp_path, file, "--start", "hinge=0.7", "--interpolate", "--columns", "tau")
+    found = ran(tmp_path, file, "--start", "hinge=0.7", "--interpolate")
     inertia, weight = 0.02 + 1.5 * 0.4**2, 1.5 * 9.81 * 0.4
 
     def law(time: float, x: np.ndarray) -> list[float]:
@@ -161,6 +163,15 @@ def test_wrong_files_are_told_and_nothing_is_written(tmp_path: Path, capsys: pyt
     assert "no column looks like a command" in refused(capsys, tmp_path, saved(tmp_path / "1.csv", t=t, x=zero))
     one = saved(tmp_path / "2.csv", t=t, cmd=zero)
     assert "1 columns of a command (cmd), but the model has 2 drives: a, b" in refused(capsys, tmp_path, one)
+    swapped = saved(tmp_path / "6.csv", t=t, second=zero, first=zero, cmd_vel_j1=zero, cmd_pos_j1=zero, cmd_j2=zero)
+    assert "cmd_vel_j1 and cmd_pos_j1 look like commands of one" in refused(capsys, tmp_path, swapped)
+    wide = saved(tmp_path / "7.csv", t=t, cmd_j1=40 + zero, cmd_j2=zero, pos_j1=zero, pos_j2=zero)
+    assert "is it in degrees or counts" in refused(capsys, tmp_path, wide)
+    few = saved(tmp_path / "8.csv", t=t, cmd_j1=zero, cmd_j2=zero, q1=zero, q2=zero, q3=zero)
+    said = refused(capsys, tmp_path, few)
+    assert "3 columns of position" in said and "--joints" not in said and "leave the positions out" in said
+    untold = refused(capsys, tmp_path, saved(tmp_path / "9.csv", a=zero, b=zero))
+    assert "one column `time`" in untold and "--rate" not in untold
     back = saved(tmp_path / "3.csv", t=np.where(np.arange(50) == 20, 0.1, t), cmd_a=zero, cmd_b=zero)
     assert "in row 20 (from 0)" in refused(capsys, tmp_path, back)
     assert "no column 'tau_x'" in refused(capsys, tmp_path, one, "--columns", "tau_x")
@@ -176,3 +187,28 @@ def test_wrong_files_are_told_and_nothing_is_written(tmp_path: Path, capsys: pyt
     assert (tmp_path / "own" / "thesis.txt").read_text() == "mine"
     (tmp_path / "run" / "model" / "loop.json").write_text("{}")
     assert "the key 'joints' is missing" in refused(capsys, tmp_path, good)
+
+
+def test_columns_that_are_stated_keep_their_order(tmp_path: Path):
+    """`x2` drives the first joint as stated; numbers in the names do not count."""
+    written(tmp_path)
+    t = 0.01 * np.arange(50)
+    u = 0.3 * np.sin(t[:, None] * [4.0, 7.0])
+    file = saved(tmp_path / "stated.csv", t=t, x1=u[:, 1], x2=u[:, 0])
+    found = ran(tmp_path, file, "--columns", "x2,x1")
+    np.testing.assert_array_equal(found["command"], u)
+
+
+def test_a_commanded_position_is_no_torque(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "pendulum.urdf").write_text(PENDULUM)
+    with jax.enable_x64(True):
+        write_model(fj.extend(fj.load_urdf(tmp_path / "pendulum.urdf")), tmp_path / "run" / "model")
+    t = 0.01 * np.arange(50)
+    assert "no column looks like a torque" in refused(capsys, tmp_path, saved(tmp_path / "1.csv", t=t, q_cmd=t))
+
+
+def test_a_recording_in_milliseconds_is_one(tmp_path: Path):
+    written(tmp_path)
+    t, zero = 0.01 * np.arange(50), np.zeros(50)
+    file = saved(tmp_path / "ms.csv", t=1e3 * t, cmd_j1=zero, cmd_j2=zero, pos_j1=zero, pos_j2=zero)
+    np.testing.assert_allclose(ran(tmp_path, file)["time"], t, rtol=0, atol=1e-9)

@@ -22,6 +22,7 @@ from ..rollouts.data import Run, Stretch, noise_of, regular, windows
 from ..rollouts.loop import Loop
 from ..rollouts.simulation import rollout
 from ..rollouts.stored import LOOP, read_loop
+from ..rollouts.task import refuse_other_units
 from .run import Done, Progress
 
 __all__ = ["SIMULATION", "simulate"]
@@ -53,9 +54,10 @@ def simulate(
 ) -> Done:
     """Move the model of a run by the commands of `file`, held from row to row, and write what it did.
 
-    A model of rollouts takes what its drives are commanded, one of torques the torques of its joints. It starts at the
-    file's first position, where it has positions (of every joint), else at `start`, else at the model's zero; at rest
-    where no velocity is told.
+    A model of rollouts takes what its drives are commanded, one of torques the torques of its joints. It starts at
+    `start` (joints that it does not name at zero), else at the positions of the file, else at the model's zero;
+    rollouts whose file has every joint's positions start with the velocity that these show, all else at the file's
+    velocity or at rest.
     Written are `simulation.csv`, `simulation.npz` and `simulation.json`; with positions in the file also how far the
     motion is from them.
     """
@@ -68,11 +70,12 @@ def simulate(
     if isinstance(moved, Loop):
         way = np.abs(np.asarray(moved.drives.transmission))
         drives, of = moved.drives.names, [robot.dof_names[k] for k in way.argmax(1)]
-        torque = not np.asarray(moved.drives.bias)[:, 1:].any()  # motors, whose command is one
+        motors = not np.asarray(moved.drives.bias)[:, 1:].any()  # whose command is a torque
+        kinds = ("command", "torque") if motors else ("command",)
     else:
         require_single_axes(robot, "a simulation of torques")
-        drives, of, torque = robot.dof_names, robot.dof_names, True
-    given = read_commands(file, drives, of, robot, torque=torque, columns=columns)
+        drives, of, kinds = robot.dof_names, robot.dof_names, ("torque", "command")
+    given = read_commands(file, drives, of, robot, kinds=kinds, columns=columns)
     plan = _planned(file, given, float(moved.dt) if isinstance(moved, Loop) else _STEP)
     position, velocity, begun = _begun(moved, file, given, start)
     after = np.minimum(plan.row + 1, len(given.time) - 1)
@@ -143,10 +146,11 @@ def _begun(
     if start is not None:
         for name, value in _stated(start, robot).items():
             q[place[name]] = value
-        return q, v, "--start"
+        return q, v, "--start, at rest"
     if given.position is None:
-        return q, v, "the model's zero"
+        return q, v, "the model's zero, at rest"
     if isinstance(moved, Loop) and given.joints == robot.dof_names:
+        refuse_other_units(moved, str(file), given.command, given.position)
         run = Run(file.name, given.time, given.command, given.position, given.velocity)
         cut = windows(moved, [run], [Stretch(0, 0, len(run.time))], [noise_of(run.position)], 0.3, smooth=True)
         state = np.asarray(cut.start)[:, 0]
@@ -155,7 +159,7 @@ def _begun(
         q[place[name]] = given.position[0, k]
         if given.velocity is not None:
             v[column[name]] = given.velocity[0, k]
-    return q, v, "the first row of the file"
+    return q, v, f"the first row of the file{', at rest' if given.velocity is None else ''}"
 
 
 def _stated(start: str, robot: RobotModel) -> dict[str, float]:

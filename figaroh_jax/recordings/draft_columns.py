@@ -280,16 +280,7 @@ def _stamps(
     if clock is None:
         assert rate is not None
         return np.arange(samples) / rate, entry | {"rate": rate}
-    time = table.vector(clock, "time")
-    if len(time) != samples:
-        raise InputError(f"{table.file}: '{clock}' is not the positions' clock: it has {len(time)} rows of {samples}")
-    back = np.flatnonzero(~(np.diff(time) > 0))
-    if len(back):
-        row = back[0] + 1
-        raise InputError(
-            f"{table.file}: '{clock}' is no clock of the positions: in row {row} (from 0) it is {time[row]:.9g} after"
-            f" {time[row - 1]:.9g}, and the stamps must increase"
-        )
+    time = _increasing(table, clock, samples, "positions")
     step = float(np.median(np.diff(time)))
     unit = next((u for u, s in _CLOCKS.items() if _SLOW <= 1 / (step * s) <= _FAST), None)
     if unit is None:
@@ -301,6 +292,21 @@ def _stamps(
     return (time - time[0]) * _CLOCKS[unit], entry | {"time": clock} | (
         {"units": {"time": unit}} if unit != "s" else {}
     )
+
+
+def _increasing(table: Table, clock: str, samples: int, of: str) -> Float[np.ndarray, " samples"]:
+    """The stamps as the file has them; `InputError` where they are not one to a row, each after the one before."""
+    time = table.vector(clock, "time")
+    if len(time) != samples:
+        raise InputError(f"{table.file}: '{clock}' is not the {of}' clock: it has {len(time)} rows of {samples}")
+    back = np.flatnonzero(~(np.diff(time) > 0))
+    if len(back):
+        row = back[0] + 1
+        raise InputError(
+            f"{table.file}: '{clock}' is no clock of the {of}: in row {row} (from 0) it is {time[row]:.9g} after"
+            f" {time[row - 1]:.9g}, and the stamps must increase"
+        )
+    return time
 
 
 def _kinds(table: Table, clock: str | None) -> dict[str, list[str]]:
@@ -432,66 +438,95 @@ def read_commands(
     of: Sequence[str],
     model: RobotModel,
     *,
-    torque: bool,
+    kinds: Sequence[str] = ("command",),
     columns: Sequence[str] = (),
 ) -> Commands:
     """Time, commands and, where they are there, positions and velocities of a file, told by the names of its columns.
 
     A column is of the drive whose name it holds, or of the joint that the drive moves (`of`); columns without such
-    names are taken in the drives' order. `torque`: the command is a torque, and columns called so are it. `columns`
-    states them (or the one array). Raises `InputError` with the columns of the file where they do not decide.
+    names are taken in the drives' order. `kinds` are those that may be it, "command" or "torque", the first one first;
+    a command that is called a position is no torque. `columns` states them (or the one array), in the drives' order
+    where they have no names of drives or joints. A file with positions has a recording's clock, in s, ms, us or ns;
+    time alone is in s. Raises `InputError` with the columns of the file where they do not decide.
     """
     table = read_table(file, "recording")
+    try:
+        return _commands(table, drives, of, model, kinds, columns)
+    except Undecided as error:
+        what = str(error).replace("give --rate HZ", "have one column `time`, in s")
+        what = what.split("Name all joints by --joints")[0].split("; name theirs in the columns' order by --joints")[0]
+        more = "" if error.option == "rate" else "; name each column after its joint, or leave the positions out"
+        raise InputError(what.rstrip() + more) from None
+
+
+def _commands(
+    table: Table,
+    drives: Sequence[str],
+    of: Sequence[str],
+    model: RobotModel,
+    wanted: Sequence[str],
+    stated: Sequence[str],
+) -> Commands:
     clock = _time(table)
     kinds = _kinds(table, clock)
-    wanted = ["command", *(["torque"] if torque else [])]
-    unknown = next((name for name in columns if name not in table.names), None)
+    unknown = next((name for name in stated if name not in table.names), None)
     if unknown is not None:
-        raise InputError(f"{file}: no column '{unknown}'; its columns are {', '.join(table.names[:12])}")
-    found = [*columns] or next((kinds[kind] for kind in wanted if kind in kinds), None)
-    found = found or [n for n in table.names if n in ("u", "ctrl") or re.fullmatch(r"(u|ctrl)[._\[]*\d+\]?", n)]
-    claimed = {name for names in kinds.values() for name in names} | {clock}
-    found = found or [n for n in table.names if n not in claimed and (_holds_any(n, drives) or _holds_any(n, of))]
+        raise InputError(f"{table.file}: no column '{unknown}'; its columns are {', '.join(table.names[:12])}")
+    found = [*stated] or _command_columns(table, kinds, clock, wanted, [*drives, *of])
     if not found:
-        what = "torque (tau, torque, effort)" if torque else "command (command, cmd, u, target)"
+        what = " or ".join({"torque": "torque (tau, effort)", "command": "command (cmd, u, target)"}[k] for k in wanted)
         raise InputError(
-            f"{file}: no column looks like a {what}; its columns are {', '.join(table.names[:12])}; name one column for"
-            f" each of {', '.join(drives)}"
+            f"{table.file}: no column looks like a {what}; its columns are {', '.join(table.names[:12])}; name one"
+            f" column for each of {', '.join(drives)}, or state them by --columns"
         )
-    command = _of_drives(table, found, drives, of)
-    time = table.vector(clock, "time")
-    if len(time) != len(command):
-        raise InputError(f"{file}: '{clock}' has {len(time)} rows, the command {len(command)}")
-    back = np.flatnonzero(~(np.diff(time) > 0))
-    if len(back):
-        row = back[0] + 1
-        raise InputError(
-            f"{file}: '{clock}' is {time[row]:.9g} in row {row} (from 0) after {time[row - 1]:.9g}; it must increase"
-        )
-    joints, states = (), {}
-    for kind in ("position", "velocity"):
-        if kind in kinds:
-            names, source, _ = _of_joints(table, kinds[kind], model, list(joints) or None, kind)
-            values = _matrix(table, source, names, kind)
-            if len(values) != len(time):
-                raise InputError(f"{file}: {kind} has {len(values)} rows, the command {len(time)}")
-            if not np.isfinite(values).all():
-                row, column = np.argwhere(~np.isfinite(values))[0]
-                raise InputError(f"{file}: {kind} of {names[column]} is no number in row {row} (from 0)")
-            joints, states = names, states | {kind: values}
-    if "position" not in states:
-        joints, states = (), {}
+    command = _of_drives(table, found, drives, of, in_order=bool(stated))
+    if "position" not in kinds:
+        return Commands(_increasing(table, clock, len(command), "commands"), command, tuple(found))
+    time, _ = _stamps(table, clock, None, len(command), {})
+    joints, source, _ = _of_joints(table, kinds["position"], model, None, "position")
+    states = {"position": _matrix(table, source, joints, "position")}
+    if "velocity" in kinds:
+        names, source, _ = _of_joints(table, kinds["velocity"], model, list(joints), "velocity")
+        if names == joints:
+            states["velocity"] = _matrix(table, source, joints, "velocity")
+    for kind, values in states.items():
+        if len(values) != len(time):
+            raise InputError(f"{table.file}: {kind} has {len(values)} rows, the command {len(time)}")
+        wrong = np.argwhere(~np.isfinite(values))
+        if len(wrong):
+            row, column = wrong[0]
+            raise InputError(f"{table.file}: {kind} of {joints[column]} is no number in row {row} (from 0)")
     return Commands(time, command, tuple(found), joints, **states)
 
 
+def _command_columns(
+    table: Table, kinds: dict[str, list[str]], clock: str, wanted: Sequence[str], names: Sequence[str]
+) -> list[str]:
+    """Columns that look like a command: by their words, as `u` or `ctrl`, or by the name of a drive or joint alone."""
+    for kind in wanted:
+        found = kinds.get(kind, [])
+        if kind == "command" and "torque" in wanted:
+            found = [name for name in found if not (_WORDS["position"] | _WORDS["velocity"]) & set(_words(name))]
+        if found:
+            return found
+    plain = [name for name in table.names if re.fullmatch(r"(u|ctrl)([._\[]*\d+\]?)?", name)]
+    claimed = {name for each in kinds.values() for name in each} | {clock}
+    return plain or [name for name in table.names if name not in claimed and _holds_any(name, names)]
+
+
 def _of_drives(
-    table: Table, columns: Sequence[str], drives: Sequence[str], of: Sequence[str]
+    table: Table, columns: Sequence[str], drives: Sequence[str], of: Sequence[str], *, in_order: bool
 ) -> Float[np.ndarray, "samples drives"]:
-    """The commands in the drives' order, by the names of drives or joints, else in the columns' own order."""
+    """The commands in the drives' order, by the names of drives or joints, else as they stand or are numbered."""
     for names in (drives, of):
-        by_name = {name: c for name in names for c in columns if _holds(c, name, names)}
-        if len(by_name) == len(set(names)):
-            return _matrix(table, [by_name[name] for name in names], drives, "command")
+        by_name = {name: [c for c in columns if _holds(c, name, names)] for name in names}
+        twice = next((each for each in by_name.values() if len(each) > 1), None)
+        if twice is not None and all(by_name.values()):
+            raise InputError(
+                f"{table.file}: {' and '.join(twice)} look like commands of one joint; state the columns by --columns"
+            )
+        if all(by_name.values()) and len(by_name) == len(drives):
+            return _matrix(table, [each[0] for each in by_name.values()], drives, "command")
     whole = len(columns) == 1 and table.read(columns[0]).ndim == 2
     count = table.read(columns[0]).shape[1] if whole else len(columns)
     if count != len(drives):
@@ -499,4 +534,5 @@ def _of_drives(
             f"{table.file}: {count} columns of a command ({', '.join(columns[:12])}), but the model has {len(drives)}"
             f" drives: {', '.join(drives)}; name one column for each"
         )
-    return _matrix(table, columns[0] if whole else sorted(columns, key=_number), drives, "command")
+    ordered = columns if in_order else sorted(columns, key=_number)
+    return _matrix(table, columns[0] if whole else list(ordered), drives, "command")

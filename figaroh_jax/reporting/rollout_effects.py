@@ -39,6 +39,7 @@ def _said(name: str, number: str, size: float, hidden_by: str, excite: str, said
 
 
 _NONE = "no simulator's file: `model/loop.json` holds it, and `figaroh-jax simulate` moves it"
+_HELD = "no simulator's file: `model/loop.json` holds it, and `fj.rollout` moves such a loop made in Python"
 
 ROLLOUT_EFFECTS = {
     "joint_damping": RolloutEffect(
@@ -143,7 +144,7 @@ ROLLOUT_EFFECTS = {
         "backlash", "Play of the gear: the link turns freely within a width.",
         "no torque while |q_motor - q_link| < width/2", "joint",
         {"stiffness": "N m/rad", "damping": "N m s/rad", "width": "rad"}, "", 0.0,
-        "elasticity, and dry friction", "slow reversals of the load of {at}", _NONE,
+        "elasticity, and dry friction", "slow reversals of the load of {at}", _HELD,
     ),
     "contact_stiffness": RolloutEffect(
         "contact stiffness", "How hard the ground is.", "force = stiffness depth", "pair of bodies",

@@ -54,6 +54,7 @@ __all__ = [
     "judged_rows",
     "one_number_notes",
     "read_rollouts",
+    "refuse_other_units",
     "simulated",
 ]
 
@@ -132,26 +133,32 @@ def _run(loop: Loop, recording: Recording) -> tuple[Run, str]:
     """A recording as a rollout takes it, and what is said of its clock."""
     if recording.command is None:
         raise InputError(f"{recording.file}: a rollout needs `command`")
-    way = np.abs(np.asarray(loop.drives.transmission))
-    columns = way.argmax(1)
+    columns = np.abs(np.asarray(loop.drives.transmission)).argmax(1)
     command = recording.command[:, columns]
-    gain, bias = np.asarray(loop.drives.gain), np.asarray(loop.drives.bias)
-    follows = (gain[:, 0] != 0) & (bias[:, 1] != 0)
-    for k, column in enumerate(columns):
-        reach = max(np.abs(recording.position[:, column]).max(), 0.3)
-        if follows[k] and np.abs(command[:, k]).max() > _TURN * reach:
-            row = int(np.abs(command[:, k]).argmax())
-            raise InputError(
-                f"{recording.file}: the command of joint {loop.robot.dof_names[column]} reaches {command[row, k]:.4g}"
-                f" rad in row {row} (from 0), but the joint never leaves +-{reach:.3g} rad: is it in degrees or counts?"
-                " Say `units: {position: deg}`, or convert it to the unit of the position"
-            )
+    follows = refuse_other_units(loop, str(recording.file), command, recording.position)
     held_out = recording.role == "holdout"
     trusted = None if recording.trusted is None else np.logical_and.reduce(recording.trusted, axis=1)
     run = Run(recording.name, recording.time, command, recording.position, recording.velocity, held_out, trusted)
     run, late = without_gaps(run)
     _check_order(loop, recording, run, follows, columns)
     return run, late
+
+
+def refuse_other_units(loop: Loop, file: str, command: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Which drives (nu,) follow their command; `InputError` where one goes far beyond what its joint (rows, nv) did."""
+    columns = np.abs(np.asarray(loop.drives.transmission)).argmax(1)
+    gain, bias = np.asarray(loop.drives.gain), np.asarray(loop.drives.bias)
+    follows = (gain[:, 0] != 0) & (bias[:, 1] != 0)
+    for k, column in enumerate(columns):
+        reach = max(np.abs(position[:, column]).max(), 0.3)
+        if follows[k] and np.abs(command[:, k]).max() > _TURN * reach:
+            row = int(np.abs(command[:, k]).argmax())
+            raise InputError(
+                f"{file}: the command of joint {loop.robot.dof_names[column]} reaches {command[row, k]:.4g}"
+                f" rad in row {row} (from 0), but the joint never leaves +-{reach:.3g} rad: is it in degrees or counts?"
+                " Say `units: {position: deg}`, or convert it to the unit of the position"
+            )
+    return follows
 
 
 def _check_order(loop: Loop, recording: Recording, run: Run, follows: np.ndarray, columns: np.ndarray) -> None:
