@@ -187,7 +187,7 @@ def _simulate(args: argparse.Namespace) -> int:
     out = args.out or Path(f"{(folder.parent if folder.name == 'model' else folder).name}_simulation")
     with terminal.Progress(quiet=args.quiet) as progress:
         columns = args.columns.split(",") if args.columns else ()
-        own = {"interpolate": args.interpolate, "start": args.start, "columns": columns}
+        own = {"interpolate": args.interpolate, "start": args.start, "columns": columns, "rate": args.rate}
         done = simulate(args.task, args.file, out, progress, **own)
     with _standard_output():
         if args.json:
@@ -307,6 +307,7 @@ def _parser() -> argparse.ArgumentParser:
     moved.add_argument("task", type=Path, metavar="MODEL_DIR", help="a run directory, or its `model`")
     moved.add_argument("--command", dest="file", type=Path, required=True, metavar="FILE", help="time and commands")
     moved.add_argument("--columns", metavar="NAME,...", help="columns of the commands, or their one array")
+    moved.add_argument("--rate", type=float, metavar="HZ", help="rate of a file that has no time column")
     moved.add_argument("--interpolate", action="store_true", help="join the rows by lines instead of holding each")
     moved.add_argument("--start", metavar="JOINT=VALUE,...", help="start (rad, m) in place of FILE's positions")
     moved.add_argument("--out", type=Path, metavar="DIR", help="run directory; an earlier run there is replaced")

@@ -171,7 +171,8 @@ def test_wrong_files_are_told_and_nothing_is_written(tmp_path: Path, capsys: pyt
     said = refused(capsys, tmp_path, few)
     assert "3 columns of position" in said and "--joints" not in said and "leave the positions out" in said
     untold = refused(capsys, tmp_path, saved(tmp_path / "9.csv", a=zero, b=zero))
-    assert "one column `time`" in untold and "--rate" not in untold
+    assert "give --rate HZ" in untold
+    assert "a positive number" in refused(capsys, tmp_path, few, "--rate", "0")
     back = saved(tmp_path / "3.csv", t=np.where(np.arange(50) == 20, 0.1, t), cmd_a=zero, cmd_b=zero)
     assert "in row 20 (from 0)" in refused(capsys, tmp_path, back)
     assert "no column 'tau_x'" in refused(capsys, tmp_path, one, "--columns", "tau_x")
@@ -212,3 +213,9 @@ def test_a_recording_in_milliseconds_is_one(tmp_path: Path):
     t, zero = 0.01 * np.arange(50), np.zeros(50)
     file = saved(tmp_path / "ms.csv", t=1e3 * t, cmd_j1=zero, cmd_j2=zero, pos_j1=zero, pos_j2=zero)
     np.testing.assert_allclose(ran(tmp_path, file)["time"], t, rtol=0, atol=1e-9)
+
+
+def test_a_file_without_a_clock_has_the_rate_that_is_stated(tmp_path: Path):
+    written(tmp_path)
+    file = saved(tmp_path / "plain.csv", cmd_j1=np.zeros(50), cmd_j2=np.zeros(50))
+    np.testing.assert_allclose(ran(tmp_path, file, "--rate", "200")["time"], 0.005 * np.arange(50), rtol=0, atol=1e-9)

@@ -30,6 +30,7 @@ __all__ = ["SIMULATION", "simulate"]
 SIMULATION = "simulation"
 _SLOWEST = 0.02  # s between rows: a file of fewer is a list of set points, and the rows are those of the steps
 _STEP = 1e-3  # s, the longest step of a model of torques
+_SPAN, _FEW = 0.05, 5  # s and least rows of a parabola that tells how fast a recording without velocities begins
 _MOST = 5_000_000  # steps
 
 
@@ -51,18 +52,20 @@ def simulate(
     interpolate: bool = False,
     start: str | None = None,
     columns: Sequence[str] = (),
+    rate: float | None = None,
 ) -> Done:
     """Move the model of a run by the commands of `file`, held from row to row, and write what it did.
 
     A model of rollouts takes what its drives are commanded, one of torques the torques of its joints. It starts at
-    `start` (joints that it does not name at zero), else at the positions of the file, else at the model's zero;
-    rollouts whose file has every joint's positions start with the velocity that these show, all else at the file's
-    velocity or at rest.
+    `start` at rest (joints that it does not name at zero), else as the file's first rows say where it has
+    positions, else at the model's zero at rest.
     Written are `simulation.csv`, `simulation.npz` and `simulation.json`; with positions in the file also how far the
     motion is from them.
     """
     folder = model / "model" if (model / "model" / "effects.yaml").is_file() else model
     check_directory(out, [folder, file])
+    if rate is not None and not 0 < rate < np.inf:
+        raise InputError(f"--rate {rate:g}: a rate in Hz is a positive number")
     progress("reading", 0.0)
     of_rollouts = (folder / LOOP).is_file()
     moved: Loop | ExtendedModel = read_loop(folder) if of_rollouts else load_model(folder)
@@ -75,7 +78,7 @@ def simulate(
     else:
         require_single_axes(robot, "a simulation of torques")
         drives, of, kinds = robot.dof_names, robot.dof_names, ("torque", "command")
-    given = read_commands(file, drives, of, robot, kinds=kinds, columns=columns)
+    given = read_commands(file, drives, of, robot, kinds=kinds, columns=columns, rate=rate)
     plan = _planned(file, given, float(moved.dt) if isinstance(moved, Loop) else _STEP)
     position, velocity, begun = _begun(moved, file, given, start)
     after = np.minimum(plan.row + 1, len(given.time) - 1)
@@ -155,11 +158,14 @@ def _begun(
         cut = windows(moved, [run], [Stretch(0, 0, len(run.time))], [noise_of(run.position)], 0.3, smooth=True)
         state = np.asarray(cut.start)[:, 0]
         return state[: robot.nv], state[robot.nv : 2 * robot.nv], "the first rows of the file"
+    begin, speed = given.position[0], None if given.velocity is None else given.velocity[0]
+    rows = max(_FEW, int(np.searchsorted(given.time - given.time[0], _SPAN)))
+    if speed is None and len(given.time) >= _FEW:
+        _, speed, begin = np.polyfit(given.time[:rows] - given.time[0], given.position[:rows], 2)
     for k, name in enumerate(given.joints):
-        q[place[name]] = given.position[0, k]
-        if given.velocity is not None:
-            v[column[name]] = given.velocity[0, k]
-    return q, v, f"the first row of the file{', at rest' if given.velocity is None else ''}"
+        q[place[name]] = begin[k]
+        v[column[name]] = 0.0 if speed is None else speed[k]
+    return q, v, "the first rows of the file"
 
 
 def _stated(start: str, robot: RobotModel) -> dict[str, float]:

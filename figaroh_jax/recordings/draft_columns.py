@@ -440,21 +440,26 @@ def read_commands(
     *,
     kinds: Sequence[str] = ("command",),
     columns: Sequence[str] = (),
+    rate: float | None = None,
 ) -> Commands:
     """Time, commands and, where they are there, positions and velocities of a file, told by the names of its columns.
 
     A column is of the drive whose name it holds, or of the joint that the drive moves (`of`); columns without such
-    names are taken in the drives' order. `kinds` are those that may be it, "command" or "torque", the first one first;
-    a command that is called a position is no torque. `columns` states them (or the one array), in the drives' order
-    where they have no names of drives or joints. A file with positions has a recording's clock, in s, ms, us or ns;
-    time alone is in s. Raises `InputError` with the columns of the file where they do not decide.
+    names are taken in the drives' order. `kinds` are those that may be it, "command" or "torque", the first one
+    first; a command that is called a position is no torque. `columns` states them (or the one array), in the
+    drives' order where they have no names of drives or joints. A file with positions has a recording's clock, in s,
+    ms, us or ns; time beside commands alone is in s; `rate` (Hz) is that of a file without a clock. Raises
+    `InputError` with the columns of the file where they do not decide.
     """
     table = read_table(file, "recording")
     try:
-        return _commands(table, drives, of, model, kinds, columns)
+        return _commands(table, drives, of, model, kinds, columns, rate)
     except Undecided as error:
-        what = str(error).replace("give --rate HZ", "have one column `time`, in s")
-        what = what.split("Name all joints by --joints")[0].split("; name theirs in the columns' order by --joints")[0]
+        what = (
+            str(error)
+            .split("Name all joints by --joints")[0]
+            .split("; name theirs in the columns' order by --joints")[0]
+        )
         more = "" if error.option == "rate" else "; name each column after its joint, or leave the positions out"
         raise InputError(what.rstrip() + more) from None
 
@@ -466,8 +471,9 @@ def _commands(
     model: RobotModel,
     wanted: Sequence[str],
     stated: Sequence[str],
+    rate: float | None,
 ) -> Commands:
-    clock = _time(table)
+    clock = _time(table) if rate is None else None
     kinds = _kinds(table, clock)
     unknown = next((name for name in stated if name not in table.names), None)
     if unknown is not None:
@@ -481,8 +487,12 @@ def _commands(
         )
     command = _of_drives(table, found, drives, of, in_order=bool(stated))
     if "position" not in kinds:
-        return Commands(_increasing(table, clock, len(command), "commands"), command, tuple(found))
-    time, _ = _stamps(table, clock, None, len(command), {})
+        if clock is None:
+            time, _ = _stamps(table, None, rate, len(command), {})
+        else:
+            time = _increasing(table, clock, len(command), "commands")
+        return Commands(time, command, tuple(found))
+    time, _ = _stamps(table, clock, rate, len(command), {})
     joints, source, _ = _of_joints(table, kinds["position"], model, None, "position")
     states = {"position": _matrix(table, source, joints, "position")}
     if "velocity" in kinds:
@@ -500,7 +510,7 @@ def _commands(
 
 
 def _command_columns(
-    table: Table, kinds: dict[str, list[str]], clock: str, wanted: Sequence[str], names: Sequence[str]
+    table: Table, kinds: dict[str, list[str]], clock: str | None, wanted: Sequence[str], names: Sequence[str]
 ) -> list[str]:
     """Columns that look like a command: by their words, as `u` or `ctrl`, or by the name of a drive or joint alone."""
     for kind in wanted:

@@ -182,7 +182,8 @@ def _without_repeats(
 ) -> Float[np.ndarray, "some columns"]:
     """The rows without those that were written twice, where a column that else rises shows that they were."""
     again = np.append(False, (numbers[1:] == numbers[:-1]).all(axis=1))
-    if texts or not again.any() or not (np.diff(numbers[~again], axis=0) > 0).all(axis=0).any():
+    steps = np.diff(numbers[~again], axis=0)
+    if texts or not again.any() or not len(steps) or not (steps > 0).all(axis=0).any():
         return numbers
     return numbers[~again]
 
