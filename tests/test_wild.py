@@ -71,6 +71,19 @@ def test_the_rows_that_were_spoiled_are_left_out_and_no_others(run: tuple[RobotM
     assert less.stamps is not None and len(less.stamps) == len(one.time)
 
 
+def test_a_row_at_which_friction_turns_beside_a_lost_packet_stays(run: tuple[RobotModel, Recording]):
+    robot, one = run
+    assert one.torque is not None
+    torque, row = one.torque.copy(), 800
+    high = np.ptp(torque[:, 0])
+    torque[row - 20 : row - 1, 0] = np.linspace(torque[row - 20, 0], 0.0, 19)
+    torque[row - 1 : row + 20, 0] = np.linspace(high, torque[row + 20, 0], 21)  # it steps from zero by its range
+    turned = replace(one, torque=torque)
+    assert wild_rows(turned, robot) is None
+    found = wild_rows(spoiled(turned, "lost", np.array([row])), robot)
+    assert found is not None and np.flatnonzero(found.rows).tolist() == [row], SEED
+
+
 def test_a_stretch_at_either_end_and_one_of_several_rows_are_left_out(run: tuple[RobotModel, Recording]):
     robot, one = run
     rng, rows = np.random.default_rng(SEED), np.r_[0:6, 400:407, len(one.time) - 3 : len(one.time)]

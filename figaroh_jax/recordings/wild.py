@@ -136,16 +136,18 @@ def wild_rows(recording: Recording, model: RobotModel) -> Wild | None:
     moved, forced, lost = np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(shape[0], bool)
     rows = np.flatnonzero(~stopped)
     while True:  # many of them hide others: they are part of what is usual
-        position, time = recording.position[rows], recording.time[rows]
+        position = recording.position[rows]
         torque = None if recording.torque is None else recording.torque[rows]
-        moved[rows] |= _wild_positions(position, time, model)
-        if torque is not None:
-            alone = pulses(torque) & _goes_on(position)[:, None]
-            forced[rows] |= wild_torque(torque, model) | pulses(torque, OF_RANGE) | alone
         both = np.hstack([position, torque]) if torque is not None and shape[1] == 1 else None
         for values in (position, torque, both):
             if values is not None and values.shape[1] > 1 and values.any():
                 lost[rows[lost_rows(values)]] = True
+        came = rows[~lost[rows]]  # beside a row of zeros, one at which friction turns would stand aside
+        moved[came] |= _wild_positions(recording.position[came], recording.time[came], model)
+        if recording.torque is not None:
+            torque = recording.torque[came]
+            alone = pulses(torque) & _goes_on(recording.position[came])[:, None]
+            forced[came] |= wild_torque(torque, model) | pulses(torque, OF_RANGE) | alone
         wild = lost | moved.any(axis=1) | forced.any(axis=1)
         if wild.mean() > MOST:
             return None
