@@ -8,6 +8,7 @@ import equinox as eqx
 import mujoco as engine
 import numpy as np
 import pytest
+from test_rollouts import HAND
 
 from figaroh_jax.formats.export import write_model
 from figaroh_jax.jobs.export import export_loop
@@ -62,6 +63,45 @@ def test_the_exported_callback_moves_mujoco_as_the_loop_moves(which: str, tmp_pa
     ours = rollout(loop, u, np.zeros(2)).reading
     assert np.ptp(seen, axis=0).min() > 0.1
     np.testing.assert_allclose(ours, seen, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("root", ["", "<freejoint name='base'/>"])
+def test_the_exported_files_start_and_move_as_the_original(root: str, tmp_path: Path):
+    """Joints whose zero is not where they start, a ball and a free base: MuJoCo C with both files."""
+    text = HAND.replace("{root}", root).replace("{integrator}", "implicitfast").replace("<body>", '<body pos="0 0 1">')
+    (tmp_path / "arm.xml").write_text(text)
+    loop, _ = load_loop(tmp_path / "arm.xml")
+    write_model(extended_of(loop), tmp_path / "model")
+    add_loop(tmp_path / "model", loop)
+    for _ in range(2):  # the second time from what the first one wrote
+        export_loop(tmp_path / "model", "mujoco", tmp_path / "out")
+        (tmp_path / "model" / "robot.xml").write_text((tmp_path / "out" / "robot.xml").read_text())
+    from figaroh_jax.rollouts.callback import Rest
+
+    models = [mujoco.MjModel.from_xml_path(str(tmp_path / name)) for name in ("arm.xml", "out/robot.xml")]
+    first, second = (mujoco.MjData(model) for model in models)
+    rest = Rest(models[1], tmp_path / "out" / "loop.json")
+    names = [models[0].joint(k).name for k in range(models[0].njnt)]
+    assert sorted(names) == sorted(models[1].joint(k).name for k in range(models[1].njnt))
+    for row in 0.8 * np.sin(0.004 * np.arange(200)[:, None] * [5.0, 9.0]):
+        for name in names:
+            np.testing.assert_allclose(second.joint(name).qpos, first.joint(name).qpos, rtol=0, atol=1e-8, err_msg=name)
+        first.ctrl[:] = row
+        mujoco.mj_step(models[0], first)
+        rest.step(second, row)
+    np.testing.assert_allclose(models[1].dof_invweight0.sum(), models[0].dof_invweight0.sum(), rtol=1e-9)
+    assert abs(first.joint("finger").qpos[0] - 0.3) > 0.1
+
+
+def test_torques_at_a_joint_of_several_axes_are_refused(tmp_path: Path):
+    (tmp_path / "arm.xml").write_text(HAND.replace("{root}", "").replace("{integrator}", "implicitfast"))
+    loop = changed(load_loop(tmp_path / "arm.xml")[0], {"offset": [0.0, 0.0, 0.0, 0.1, 0.0]})
+    write_model(extended_of(loop), tmp_path / "model")
+    add_loop(tmp_path / "model", loop)
+    from figaroh_jax.rollouts.callback import Rest
+
+    with pytest.raises(ValueError, match=r"tip\.wy: .* several axes"):
+        Rest(mujoco.MjModel.from_xml_path(str(tmp_path / "model" / "robot.xml")), tmp_path / "model" / "loop.json")
 
 
 def test_a_drive_with_a_state_is_refused(tmp_path: Path):

@@ -28,10 +28,11 @@ from figaroh_jax.rollouts.sensitivity import Windows, linear_sums
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
 LIMITS = 'range="-.15 .2" limited="true" margin=".01"'
+WEAK = 'actuatorfrcrange="-12 9"'  # N m of all drives of a joint together
 
 
 @pytest.mark.parametrize("integrator", ["implicitfast", "Euler"])
-@pytest.mark.parametrize("more", ["", LIMITS])
+@pytest.mark.parametrize("more", ["", LIMITS, WEAK])
 def test_seven_joints_with_friction_and_limits_are_mujocos(tmp_path: Path, integrator: str, more: str):
     path = written(tmp_path, chain(7, integrator, more))
     loop, _ = load_loop(path)
@@ -40,7 +41,7 @@ def test_seven_joints_with_friction_and_limits_are_mujocos(tmp_path: Path, integ
     run = Run("run", 0.002 * np.arange(2500), command, truth, rates)
     data = windows(loop, [run], [Stretch(0, 0, 2500)], [np.ones(7), np.ones(7)], 1.0)
     read = native(loop, (), data).read(np.zeros(0), np.zeros((14, 1)))[:2500, :, 0]
-    assert not more or (truth < -0.15).any()
+    assert more != LIMITS or (truth < -0.15).any()
     np.testing.assert_allclose(read[:, :7], truth, rtol=0, atol=1e-9)
     np.testing.assert_allclose(read[:, 7:], rates, rtol=0, atol=1e-7)
 
@@ -121,6 +122,14 @@ def test_derivatives_of_an_arm_are_those_of_differences(tmp_path: Path, law: str
     own = [[0.05, 0.02], [0.5, 0.1], [0.3, 0.1], [0.06, 0.1], [0.1, 0.05], [0.3, 0.2], [0.4, 0.1], [0.1, -0.1]]
     theta = np.concatenate([*own, [0.1, 0.05], [0.01, 0.005], [1e-3, 5e-4], [1.1, 0.0043, 0.7, 0.2, 0.01, 0.05]])
     checked(loop, table, theta, data, np.asarray(data.start))
+
+
+def test_derivatives_at_the_end_of_a_torque_range_are_those_of_differences(tmp_path: Path):
+    loop, run = arm(tmp_path)
+    loop = eqx.tree_at(lambda m: m.joints.torque_range, loop, np.tile([-2.0, 1.5], (6, 1)))
+    data = windows(loop, [run], [Stretch(0, 100, 60)], [np.full(6, 2e-4)], 0.3)
+    table = tuple(Entry(name, (k,)) for k in (1, 2) for name in ("kd", "scale", "friction"))
+    checked(loop, table, np.array([0.7, 1.1, 0.3, 0.5, 0.9, 0.2]), data, np.asarray(data.start))
 
 
 def test_derivatives_with_coloured_noise_are_those_of_differences(tmp_path: Path):

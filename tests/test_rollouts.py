@@ -131,6 +131,63 @@ def test_legs_with_limits_are_mujocos(tmp_path: Path, root: str):
     np.testing.assert_allclose(found, truth, rtol=0, atol=1e-6)
 
 
+HAND = """<mujoco><compiler angle="radian"/><option timestep="0.004" integrator="{integrator}"><flag contact="disable"/></option>
+<worldbody><body>{root}<inertial pos="0 .02 0" mass="1" diaginertia=".01 .02 .02"/>
+<body pos="0 .1 .1"><joint name="thumb" axis="0 1 .3" damping=".1" armature=".01" actuatorfrcrange="-.5 .4"/>
+<inertial pos=".1 0 0" mass=".4" diaginertia=".004 .006 .006"/></body>
+<body pos="0 -.1 .1"><joint name="finger" axis="0 1 0" ref=".3" damping=".1" armature=".02" frictionloss=".05"/>
+<inertial pos=".1 0 0" mass=".5" diaginertia=".004 .006 .006"/><body pos=".2 0 0"><joint name="tip" type="ball" damping=".05" armature=".005"/>
+<inertial pos=".05 .03 .02" mass=".2" diaginertia=".002 .003 .003"/></body></body></body></worldbody>
+<tendon><fixed name="grip"><joint joint="thumb" coef="1"/><joint joint="finger" coef="-.7"/></fixed></tendon><actuator>
+<position name="close" tendon="grip" kp="9" kv=".9"/><position name="thumb" joint="thumb" kp="30" kv="1.5"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("integrator", ["implicitfast", "RK4"])
+@pytest.mark.parametrize("root", ["", "<freejoint/>"])
+def test_a_hand_is_mujocos(tmp_path: Path, root: str, integrator: str):
+    """A drive of fingers on two branches, one at the end of its torque range, beside a ball and a free base."""
+    path = written(tmp_path, HAND.replace("{root}", root).replace("{integrator}", integrator))
+    loop, notes = load_loop(path)
+    command = waves(150, 0.004, 2, 1.5, seed=5)
+    truth, _ = mujoco_c(path, command)
+    found = np.asarray(rollout(loop, command, loop.start).position)
+    if root:
+        found = np.concatenate([found[:, :3], found[:, 6:7], found[:, 3:6], found[:, 7:]], 1)
+    found = np.concatenate([found[:, :-4], found[:, -1:], found[:, -4:-1]], 1)  # the tip's w, x, y, z
+    assert notes == () and loop.drives.across and np.ptp(truth[:, -6:-4], axis=0).min() > 0.1
+    assert np.ptp(truth[:, -3:], axis=0).min() > 1e-3
+    np.testing.assert_allclose(found, truth, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "told"),
+    [
+        ('<fixed name="grip">', '<fixed name="grip" armature=".1">', "armature of tendons"),
+        ('<fixed name="grip">', '<fixed name="grip" range="-1 1">', "limits of tendons"),
+        ('type="ball"', 'type="ball" stiffness="2"', "the spring of joint 'tip'"),
+        ('type="ball"', 'type="ball" range="0 1"', "the limit of joint 'tip'"),
+        ('kp="9"', 'kp="9" delay=".01" nsample="4"', "between the stages of RK4"),
+        ('contact="disable"', 'contact="disable" refsafe="disable"', "refsafe"),
+    ],
+)
+def test_what_a_file_has_beside_the_loop_is_told(tmp_path: Path, was: str, now: str, told: str):
+    text = (
+        HAND.replace("{root}", "")
+        .replace("{integrator}", "RK4")
+        .replace("frictionloss", 'solreffriction=".003 1" frictionloss')
+    )
+    _, notes = load_loop(written(tmp_path, text.replace(was, now)))
+    assert len(notes) == 1 and told in notes[0]
+
+
+def test_explicit_damping_is_told_and_actuators_that_are_off_are_refused(tmp_path: Path):
+    text = HAND.replace("{root}", "").replace("{integrator}", "Euler")
+    _, notes = load_loop(written(tmp_path, text.replace('contact="disable"', 'contact="disable" eulerdamp="disable"')))
+    assert notes == ("explicit damping (option flag eulerdamp is disabled)",)
+    with pytest.raises(InputError, match="actuation is disabled"):
+        load_loop(written(tmp_path, text.replace('contact="disable"', 'contact="disable" actuation="disable"')))
+
+
 def test_a_hard_friction_holds_the_joint_and_never_pulls(tmp_path: Path):
     path = written(tmp_path, chain(1, "implicitfast").replace('frictionloss="1.0000"', 'frictionloss="3"'))
     loop, _ = load_loop(path, law="hard")

@@ -115,7 +115,7 @@ def _planned(file: Path, given: Commands, longest: float) -> _Plan:
         )
     steps = np.diff(time)
     even = bool((np.abs(steps - np.median(steps)) <= 0.5 * np.median(steps)).all())
-    if given.position is not None or (even and np.median(steps) <= _SLOWEST):
+    if given.position is not None or (even and np.median(steps) <= _SLOWEST * (1 + 1e-6)):
         period = regular(str(file), time)
         many = max(1, int(np.ceil(period / longest - 1e-6)))
         count = np.arange((len(time) - 1) * many + 1)

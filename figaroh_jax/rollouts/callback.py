@@ -26,6 +26,8 @@ import numpy as np
 
 __all__ = ["Rest"]
 
+_HERE = ("stribeck_force", "load_ratio", "stiffness", "offset", "ripple_sine", "ripple_cosine", "reading")
+
 
 class Rest:
     """Moves a model of `robot.xml` with everything that `loop.json` says; one for each simulation."""
@@ -35,6 +37,13 @@ class Rest:
     ):
         content = json.loads(Path(file).read_text(encoding="utf-8"))
         joints, drives = list(content["joints"].items()), list(content["drives"].items())
+        single = {model.joint(j).name for j in np.flatnonzero(model.jnt_type >= 2)}  # slides and hinges
+        for name, one in joints:  # balls and free bases: all of it is in `robot.xml`
+            if name not in single and any(one[word] for word in _HERE):
+                raise ValueError(
+                    f"{name}: friction, torques and readings of joints of several axes cannot be said here"
+                )
+        joints = [(name, one) for name, one in joints if name in single]
         self.model, self.late = model, []
         self.at = np.array([model.joint(name).dofadr[0] for name, _ in joints], int)
         self.place = np.array([model.joint(name).qposadr[0] for name, _ in joints], int)
@@ -86,7 +95,7 @@ class Rest:
         engine.mj_step(model, data)
 
     def reading(self, data: Any) -> np.ndarray:
-        """What the encoders of the joints show, (joints,), rad or m."""
+        """What the encoders of the joints of one axis show, (joints,), rad or m."""
         return data.qpos[self.place] + self.joints["reading"]
 
     def _at_the_joints(self, engine: Any, data: Any, changed: bool) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+from scipy.spatial.transform import Rotation
 
 from ..effects.base import Effect
 from ..errors import InputError, nearest
@@ -118,6 +119,7 @@ def with_drives(file: Path, content: dict[str, Any]) -> str:
     option.set("iterations", str(_ITERATIONS[0]))
     option.set("ls_iterations", str(_ITERATIONS[1]))
     _with_limits(root, content)
+    _with_start(root, content)
     for old in root.findall("actuator"):
         root.remove(old)
     actuators = etree.SubElement(root, "actuator")
@@ -167,7 +169,9 @@ def _way(root: Any, name: str, drive: dict[str, Any]) -> dict[str, str]:
 def _with_limits(root: Any, content: dict[str, Any]) -> None:
     """Ranges and softness of limits and dry friction at the joints, as the loop has them."""
     for joint in root.iter("joint"):
-        own, limit = content["joints"].get(joint.get("name")), content.get("limits", {}).get(joint.get("name"))
+        name = joint.get("name")
+        name = name if name in content["joints"] else f"{name}.wx"  # of a ball
+        own, limit = content["joints"].get(name), content.get("limits", {}).get(name)
         if own is None or limit is None:
             continue
         _set_range(joint, "", limit["range"])
@@ -182,6 +186,65 @@ def _with_limits(root: Any, content: dict[str, Any]) -> None:
             impedance, time = _friction_words(content, own)
             joint.set("solreffriction", _text([time, 1.0]))
             joint.set("solimpfriction", _text([impedance, impedance, 0.001, 0.5, 2.0]))
+
+
+def _with_start(root: Any, content: dict[str, Any]) -> None:
+    """The configuration at which the loop starts as that of the file: `ref` of joints, the pose of a free base.
+
+    MuJoCo sets the softness of friction and limits there. What the numbers of the joints mean stays as it was.
+    """
+    start, moved = _starts(content), dict[str, float]()
+    for body in root.iter("body"):
+        joints = body.findall("joint")
+        at = start.get(joints[0].get("name")) if len(joints) == 1 else None
+        kind = joints[0].get("type") if at is not None else ""
+        if at is None or len(at) != {"hinge": 1, "slide": 1, "free": 7}.get(kind):
+            continue
+        if kind == "free":
+            body.set("pos", _text(at[:3]))
+            body.set("quat", _text([at[6], *at[3:6]]))
+            continue
+        before = float(joints[0].get("ref", 0.0))
+        if (way := at[0] - before) == 0:
+            continue
+        moved[joints[0].get("name")] = way
+        joints[0].set("ref", _text(at))
+        axis, anchor = (_vector(joints[0], word, np.zeros(3)) for word in ("axis", "pos"))
+        place, turn = _vector(body, "pos", np.zeros(3)), _rotation(body)
+        about = Rotation.from_rotvec(way * axis / np.linalg.norm(axis) if kind == "hinge" else np.zeros(3))
+        shift = anchor - about.apply(anchor) if kind == "hinge" else way * axis / np.linalg.norm(axis)
+        body.set("pos", _text((place + turn.apply(shift)).tolist()))
+        x, y, z, w = (turn * about).as_quat().tolist()
+        body.set("quat", _text([w, x, y, z]))
+    for follower in root.iterfind("equality/joint"):  # told by how far both are from where the file has them
+        numbers = _vector(follower, "polycoef", np.array([0.0, 1.0, 0.0, 0.0, 0.0]))
+        numbers[0] += numbers[1] * moved.get(follower.get("joint2"), 0.0) - moved.get(follower.get("joint1"), 0.0)
+        follower.set("polycoef", _text(numbers.tolist()))
+
+
+def _starts(content: dict[str, Any]) -> dict[str, list[float]]:
+    """Where each joint starts; by its own name also where it has several coordinates."""
+    found, at = dict[str, list[float]](), 0
+    for joint in dict.fromkeys(name.rsplit(".", 1)[0] if _part(name) else name for name in content["joints"]):
+        many = sum(name == joint or (_part(name) and name.rsplit(".", 1)[0] == joint) for name in content["joints"])
+        many += many > 1  # a quaternion, or the cosine and sine of an angle
+        found[joint] = content.get("start", [])[at : at + many]
+        at += many
+    return found
+
+
+def _part(name: str) -> bool:
+    """Whether a coordinate is one of several of its joint."""
+    return name.rsplit(".", 1)[-1] in ("vx", "vy", "vz", "wx", "wy", "wz")
+
+
+def _vector(element: Any, word: str, default: np.ndarray) -> np.ndarray:
+    return np.array(element.get(word).split(), float) if element.get(word) else default.copy()
+
+
+def _rotation(body: Any) -> Rotation:
+    w, x, y, z = _vector(body, "quat", np.array([1.0, 0.0, 0.0, 0.0]))
+    return Rotation.from_quat([x, y, z, w])
 
 
 def _friction_words(content: dict[str, Any], own: dict[str, float]) -> tuple[float, float]:

@@ -169,10 +169,11 @@ class Step:
                 free = (force > weakest) & (force < strongest)
                 force, slope = jnp.clip(force, weakest, strongest), jnp.where(free, slope, 0.0)
             motor = way * force
+            if not (_infinite(get("least")) and _infinite(get("most"))):
+                slope = jnp.where((motor < get("least")) | (motor > get("most")), 0.0, slope)
+                motor = jnp.clip(motor, get("least"), get("most"))
             if self.p.implicit:
                 damping = damping - way * way * slope
-            if not (_infinite(get("least")) and _infinite(get("most"))):
-                motor = jnp.clip(motor, get("least"), get("most"))
         passive = get("damping") * v + get("offset")
         if not _zero(get("stiffness")):
             stretch = q - get("rest")

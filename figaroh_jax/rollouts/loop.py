@@ -22,6 +22,7 @@ from jaxtyping import Array
 
 from ..effects.base import Effect
 from ..rigid.dynamics import joint_masses, joint_torques
+from ..rigid.kinematics import ancestors
 from ..rigid.manifold import integrate
 from ..rigid.model import RobotModel
 from ..rigid.spatial import cross, quaternion_rotation, rotate, rotate_back
@@ -39,6 +40,7 @@ __all__ = [
     "Pairs",
     "State",
     "Step",
+    "acts_across",
     "advance",
     "alike",
     "brought_back",
@@ -76,6 +78,7 @@ class Drives(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     activation: tuple[Activation, ...] = eqx.field(static=True)
     early: tuple[bool, ...] = eqx.field(static=True)  # the force takes the activation of the end of the step
+    across: bool = eqx.field(static=True, default=False)  # one acts on joints of several branches (`acts_across`)
 
 
 class Joints(eqx.Module):
@@ -301,7 +304,7 @@ def _next_activation(loop: Loop, act: Array, rate: Array) -> Array:
 
 class _Drive(NamedTuple):
     torque: Array  # (nv, samples) of all drives
-    slope: Array  # (nu, samples) of each force by its rate, where it is not limited
+    slope: Array  # (nu, samples) of each force by its rate, as the implicit step takes it: not where it is limited
 
 
 def _drive(loop: Loop, angle: Array, v: Array, control: Array) -> _Drive:
@@ -317,9 +320,13 @@ def _drive(loop: Loop, angle: Array, v: Array, control: Array) -> _Drive:
     slope = bias[:, 2] + gain[:, 2] * control
     force = jnp.clip(force, -volt, volt) + slope * rate
     low, high = (jnp.asarray(drives.force_range)[:, k, None] for k in (0, 1))
-    free = (force > low) & (force < high)
     torque = times(way.T[..., None], jnp.clip(force, low, high))
     least, most = (jnp.asarray(loop.joints.torque_range)[:, k, None] for k in (0, 1))
+    alone = (way != 0) & (
+        (way != 0).sum(1, keepdims=True) == 1
+    )  # MuJoCo asks the joint of a drive, not those of a tendon
+    held = (alone[..., None] & ((torque < least) | (torque > most))).any(1)
+    free = (force > low) & (force < high) & ~held
     return _Drive(jnp.clip(torque, least, most), jnp.where(free, slope, 0.0))
 
 
@@ -372,6 +379,8 @@ def _resistance(loop: Loop, slope: Array) -> Array:
     damping = jnp.eye(loop.robot.nv)[..., None] * jnp.asarray(loop.joints.damping)[:, None, None]
     way = jnp.asarray(loop.drives.transmission)
     pairs = way[:, :, None, None] * way[:, None, :, None]
+    if loop.drives.across:
+        pairs = pairs * _together(loop.robot)[..., None]
     if loop.pairs is not None:
         damping = damping + loop.pairs.across(loop.pairs.damping, loop.robot.nv)[..., None]
     return damping - (pairs * slope[:, None, None]).sum(0)
@@ -384,7 +393,30 @@ def _resisted(loop: Loop, slope: Array, a: Array) -> Array:
     own = jnp.asarray(loop.joints.damping)[:, None] * a
     if loop.pairs is not None:
         own = own + times(loop.pairs.across(loop.pairs.damping, len(a))[..., None], a)
+    if loop.drives.across:
+        share = jnp.einsum("ij,kjs->kis", _together(loop.robot), way[..., None] * a)
+        return own - (way[..., None] * slope[:, None] * share).sum(0)
     return own - times(way.T[..., None], slope * rate)
+
+
+def acts_across(robot: RobotModel, transmission: np.ndarray) -> bool:
+    """Whether a drive acts on coordinates of which neither carries the other, as one of two fingers does.
+
+    MuJoCo's implicit step takes what such a drive does at one of them by the speed of the other explicitly.
+    """
+    on = np.asarray(transmission) != 0
+    return bool((on[:, :, None] & on[:, None, :] & ~_together(robot).astype(bool)).any())
+
+
+def _together(robot: RobotModel) -> np.ndarray:
+    """1 where one of two coordinates moves what the other one is on, (nv, nv): the places of the inertia matrix."""
+    over = ancestors(robot.joints)
+    every = (over + over.T) > 0
+    found = np.zeros((robot.nv, robot.nv))
+    for dof in zip(robot.dofs.joint, robot.dofs.column, strict=True):
+        for other in zip(robot.dofs.joint, robot.dofs.column, strict=True):
+            found[dof[1], other[1]] = max(found[dof[1], other[1]], float(every[dof[0], other[0]]))
+    return found
 
 
 def _rows(loop: Loop, angle: Array, v: Array, motor: Array, bias: Array, weight: Array, more: Array) -> Rows:
@@ -537,26 +569,34 @@ def _inertial(loop: Loop, state: State, bias: Array, *accelerations: Array) -> l
 
 def _moved(loop: Loop, state: State, a: Array, activation: Array) -> State:
     """Semi-implicit: the new velocity carries the position; `a` is in MuJoCo's axes at free joints."""
-    v = state.v + loop.dt * a
-    if loop.robot.nq == loop.robot.nv:
-        return State(state.q + loop.dt * v, v, _remembered(loop, state, v, activation))
-    q = state.q
+    v = _turned(loop, state.q, state.v + loop.dt * a, rotate)
+    q = _carried(loop, state.q, loop.dt * v)
+    v = _turned(loop, q, v, rotate_back)
+    return State(q, v, _remembered(loop, state, v, activation))
+
+
+def _turned(loop: Loop, q: Array, v: Array, turn: Any) -> Array:
+    """Linear rates of free joints from their own axes to the world's, where MuJoCo has them (`rotate`), or back."""
     for joint, at in zip(loop.robot.joints, loop.robot.dofs.positions, strict=True):
-        k = joint.coordinate
-        if joint.kind != "free":
-            continue
-        turn = quaternion_rotation(q[at.start + 3 : at.stop])
-        world = rotate(turn, v[k : k + 3])
-        spin = jnp.zeros_like(v).at[k + 3 : k + 6].set(loop.dt * v[k + 3 : k + 6])
-        after = integrate(loop.robot, q.T, spin.T).T
-        back = rotate_back(quaternion_rotation(after[at.start + 3 : at.stop]), world)
-        q = q.at[at].set(jnp.concatenate([q[at.start : at.start + 3] + loop.dt * world, after[at.start + 3 : at.stop]]))
-        v = v.at[k : k + 3].set(back)
-    still = v
+        if joint.kind == "free":
+            k = joint.coordinate
+            v = v.at[k : k + 3].set(turn(quaternion_rotation(q[at.start + 3 : at.stop]), v[k : k + 3]))
+    return v
+
+
+def _carried(loop: Loop, q: Array, step: Array) -> Array:
+    """The position after a step, whose linear part at free joints is along the world's axes."""
+    if loop.robot.nq == loop.robot.nv:
+        return q + step
+    own = step
     for joint in loop.robot.joints:
         if joint.kind == "free":
-            still = still.at[joint.coordinate : joint.coordinate + 6].set(0.0)
-    return State(integrate(loop.robot, q.T, loop.dt * still.T).T, v, _remembered(loop, state, v, activation))
+            own = own.at[joint.coordinate : joint.coordinate + 3].set(0.0)
+    after = integrate(loop.robot, q.T, own.T).T
+    for joint, at in zip(loop.robot.joints, loop.robot.dofs.positions, strict=True):
+        if joint.kind == "free":
+            after = after.at[at.start : at.start + 3].add(step[joint.coordinate : joint.coordinate + 3])
+    return after
 
 
 def _remembered(loop: Loop, state: State, v: Array, activation: Array) -> Array:
@@ -572,26 +612,51 @@ def _runge_kutta(
 ) -> tuple[State, Step]:
     """The classical scheme of fourth order, the constraints solved at each stage."""
     shares, solutions, rates, now = (0.0, 0.5, 0.5, 1.0), [], [], state
+    start = _turned(loop, state.q, state.v, rotate)  # stages add up in MuJoCo's axes
     for k, share in enumerate(shares):
         if k:
-            now = State(*(x + share * loop.dt * r for x, r in zip(state, rates[-1], strict=True)))
+            now = _stage(loop, state, start, rates[-1], share)
+        smooth = _smooth(loop, now, u, weight)
         if step is None:
-            smooth, _, solution = _accelerate(loop, now, u, weight, warm)
+            solution = solve_rows(_masses(loop, now.q), smooth.torque - smooth.bias, smooth.rows, warm)
             a = warm = solution.a
         else:
-            smooth = _smooth(loop, now, u, weight)
             solution = jax.lax.stop_gradient(jax.tree.map(lambda x, k=k: x[k], step.solution))
             masses = jax.lax.stop_gradient(_masses(loop, now.q))
             (first,) = _inertial(loop, now, smooth.bias, solution.a)
             a = corrected(masses, smooth.rows, solution, first + smooth.bias - smooth.torque)
         solutions.append(solution)
-        rates.append(State(now.v, a, smooth.rate))
+        speed, change = (_turned(loop, now.q, x, rotate) for x in (now.v, a + smooth.shift))
+        way = share * loop.dt * rates[-1].q if k else jnp.zeros_like(speed)
+        rates.append(State(_along(loop, way, speed), change, smooth.rate))
     weights = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
     mean = jax.tree.map(lambda *parts: sum(w * r for w, r in zip(weights, parts, strict=True)), *rates)
-    v, drives = state.v + loop.dt * mean.v, len(loop.drives.names)
+    after, drives = _stage(loop, state, start, mean, 1.0), len(loop.drives.names)
     active = _next_activation(loop, state.act[:drives], mean.act[:drives])
-    after = State(state.q + loop.dt * mean.q, v, _remembered(loop, state, v, active))
+    after = State(after.q, after.v, _remembered(loop, state, after.v, active))
     return after, Step(jax.tree.map(lambda *x: jnp.stack(x), *solutions), solutions[-1].a)
+
+
+def _along(loop: Loop, way: Array, speed: Array) -> Array:
+    """How fast the logarithm of a turn grows where it is `way`: the spin w itself at zero (Munthe-Kaas 1999).
+
+    w + s x w / 2 + g s x (s x w) with g = (1 - |s|/2 cot(|s|/2)) / |s|^2, by its series.
+    """
+    for joint in loop.robot.joints:
+        if joint.kind in ("spherical", "free"):
+            at = slice(joint.coordinate + 3 * (joint.kind == "free"), joint.coordinate + 3 * (joint.kind == "free") + 3)
+            turn, spin = way[at], speed[at]
+            x, once = (turn**2).sum(0), cross(turn, spin)
+            g = 1 / 12 + x * (1 / 720 + x * (1 / 30240 + x * (1 / 1209600 + x / 47900160)))
+            speed = speed.at[at].set(spin + once / 2 + g * cross(turn, once))
+    return speed
+
+
+def _stage(loop: Loop, state: State, start: Array, rate: State, share: float) -> State:
+    """The state after a share of a step at this rate; `start` is its velocity in MuJoCo's axes."""
+    q, v, act = (share * loop.dt * r for r in rate)
+    q = _carried(loop, state.q, q)
+    return State(q, _turned(loop, q, start + v, rotate_back), state.act + act)
 
 
 def observe(loop: Loop, state: State) -> Array:

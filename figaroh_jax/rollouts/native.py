@@ -216,6 +216,7 @@ def _fits(loop: Loop, table: Table, data: Windows) -> bool:
     robot = loop.robot
     plain = all(joint.kind in ("revolute", "prismatic") and not joint.follows for joint in robot.joints)
     simple = len(robot.joints) == robot.nv and all(kind == "none" for kind in loop.drives.activation)
+    simple &= not loop.drives.across
     small = (
         max(robot.nv, len(loop.drives.names), 2 * len(loop.measured)) <= _MOST
         and len(table) + 2 * robot.nv <= _MOST_COLUMNS

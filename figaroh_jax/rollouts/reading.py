@@ -17,10 +17,11 @@ from ..formats.usd import UsdJoint, usd_joints
 from ..formats.xmlfile import find_in_packages
 from ..rigid.manifold import neutral
 from ..rigid.model import RobotModel
-from .loop import Activation, Drives, Integrator, Joints, Loop
+from .loop import Activation, Drives, Integrator, Joints, Loop, acts_across
 
 __all__ = ["joint_drives", "load_loop", "plain_joints"]
 
+_INTEGRATORS: dict[int, Integrator] = {0: "euler", 1: "rk4", 3: "implicitfast"}
 _SOLREF, _SOLIMP = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)  # MuJoCo's defaults
 
 
@@ -176,6 +177,7 @@ def _drives(
     delay: np.ndarray | None = None,
     activation: tuple[Activation, ...] = (),
     early: tuple[bool, ...] = (),
+    across: bool = False,
 ) -> Drives:
     free, zero = np.tile([-np.inf, np.inf], (len(names), 1)), np.zeros(len(names))
     return Drives(
@@ -193,15 +195,15 @@ def _drives(
         names=names,
         activation=activation or tuple("none" for _ in names),
         early=early or (False,) * len(names),
+        across=across,
     )
 
 
 def _integrator(mj: Any, path: str | Path, wanted: Integrator | None) -> Integrator:
     kind = int(mj.opt.integrator)
-    known: dict[int, Integrator] = {0: "euler", 1: "rk4", 3: "implicitfast"}
-    if kind not in known and wanted is None:
+    if kind not in _INTEGRATORS and wanted is None:
         raise InputError(f"{path}: option integrator is implicit; euler, implicitfast and RK4 are simulated")
-    return known.get(kind, "implicitfast")
+    return _INTEGRATORS.get(kind, "implicitfast")
 
 
 def _start(mj: Any, robot: RobotModel) -> np.ndarray:
@@ -233,6 +235,11 @@ def _mjcf_joints(mj: Any, robot: RobotModel) -> tuple[Joints, tuple[str, ...]]:
             _mjcf_dof(mj, own, j, first + k, joint.coordinate + k, dt)
         if joint.kind in ("revolute", "prismatic"):
             _mjcf_joint(mj, own, j, joint.coordinate, notes, joint.name)
+            continue
+        if mj.jnt_stiffness[j] and not disabled(mj, "SPRING"):
+            notes.append(f"the spring of joint '{joint.name}', which has several axes")
+        if mj.jnt_limited[j] and not (disabled(mj, "LIMIT") or disabled(mj, "CONSTRAINT")):
+            notes.append(f"the limit of joint '{joint.name}', which has several axes")
     return own, (*notes, *_left_out(mj))
 
 
@@ -264,20 +271,37 @@ def _mjcf_joint(mj: Any, own: Joints, j: int, k: int, notes: list[str], name: st
 
 def _left_out(mj: Any) -> list[str]:
     notes = []
+    scheme = _INTEGRATORS.get(int(mj.opt.integrator))
+    if scheme == "rk4" and hasattr(mj, "actuator_delay") and mj.actuator_delay.any():
+        notes.append("what a late command does between the stages of RK4")
+    if disabled(mj, "REFSAFE") and _stiff(mj):
+        notes.append("softness of less than two time steps (option flag refsafe is disabled)")
+    if scheme == "euler" and disabled(mj, "EULERDAMP") and mj.dof_damping.any():
+        notes.append("explicit damping (option flag eulerdamp is disabled)")
     if mj.opt.density or mj.opt.viscosity:
         notes.append("forces of the fluid (option density, viscosity)")
     if mj.body_gravcomp.any():
         notes.append("gravcomp of bodies")
-    if mj.tendon_stiffness.any() or mj.tendon_damping.any() or mj.tendon_frictionloss.any():
-        notes.append("stiffness, damping and friction of tendons")
+    if any(getattr(mj, f"tendon_{word}").any() for word in ("stiffness", "damping", "frictionloss", "armature")):
+        notes.append("stiffness, damping, friction and armature of tendons")
+    if (mj.tendon_limited.any() and not disabled(mj, "LIMIT")) or mj.tendon_actfrclimited.any():
+        notes.append("limits of tendons")
     if not disabled(mj, "CONTACT") and (mj.geom_contype.any() or mj.geom_conaffinity.any()):
         notes.append("contacts of geoms")
     return notes
 
 
+def _stiff(mj: Any) -> bool:
+    """Whether dry friction or a limit is softer in the file's words than it may be where MuJoCo is safe."""
+    softness = np.concatenate([mj.dof_solref[:, 0][mj.dof_frictionloss > 0], mj.jnt_solref[:, 0][mj.jnt_limited > 0]])
+    return bool(((softness > 0) & (softness < 2 * mj.opt.timestep)).any())
+
+
 def _mjcf_drives(mj: Any, robot: RobotModel, path: str) -> tuple[Drives, list[str]]:
     """The actuators that act at joints that move, and the names of those whose joints all stand still."""
     every = tuple(mj.actuator(a).name or f"actuator {a}" for a in range(mj.nu))
+    if mj.nu and disabled(mj, "ACTUATION"):
+        raise InputError(f"{path}: option flag actuation is disabled: no actuator acts; enable it")
     rows = [_transmission(mj, robot, a, path, every[a]) for a in range(mj.nu)]
     on = [a for a, row in enumerate(rows) if row is not None]
     way = np.array([row for row in rows if row is not None]).reshape(len(on), robot.nv)
@@ -300,6 +324,7 @@ def _mjcf_drives(mj: Any, robot: RobotModel, path: str) -> tuple[Drives, list[st
         delay=_delays(mj, path, every)[on],
         activation=kinds,
         early=tuple(bool(mj.actuator_actearly[a]) for a in on),
+        across=acts_across(robot, way),
     )
     return drives, [name for a, name in enumerate(every) if a not in on]
 

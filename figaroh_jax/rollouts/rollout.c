@@ -99,7 +99,7 @@ typedef struct {
   long which[PAIRS];
   double way[PAIRS], pair_level[PAIRS], pair_pull[PAIRS], pair_soft[PAIRS], pair_weight[PAIRS];
   double by_scale[ACTING], by_gain[ACTING], by_band[ACTING];
-  int volt[ACTING], limit[ACTING], inside[ACTING];
+  int volt[ACTING], limit[ACTING], inside[ACTING], stepped[ACTING]; /* stepped: the implicit step takes its slope */
   double mass, base, steep, at;                               /* of a carried joint */
   const double *more;
 } Work;
@@ -459,6 +459,14 @@ ALIKE void resisted(const Given *g, Work *w, const int n) {
     w->pair_level[k] = PN(RUB) > 0 ? PN(RUB) : 0;
     w->pair_pull[k] = g->hard ? -rate / g->dt : -g->joint[RATE * n + i] * rate;
     w->pair_soft[k] = w->pair_weight[k] * (g->hard ? 1e-9 : g->joint[SHARE * n + i]);
+  }
+  for (long d = 0; d < g->nu; d++) { /* as MuJoCo: not where the one joint of a drive is at the end of its torque range */
+    const double *way = g->way + d * n;
+    int one = 0, many = 0;
+    for (int j = 0; j < n; j++)
+      if (way[j] != 0) one = j, many++;
+    w->stepped[d] = w->inside[d] && (many != 1 || w->within[one]);
+    if (!w->stepped[d]) w->slope[d] = 0;
   }
 }
 
@@ -868,12 +876,12 @@ INLINE void linearised(const Given *g, const Rigid *rigid, const int lane, Work 
       const double *way = g->way + d * n;
       double f = 0, bend = 0;
       if (kind == OF_DRIVE + SCALE) f = w->by_scale[d];
-      if (kind == OF_DRIVE + DELAY) f = w->by_u[d] * w->faster[d], bend = w->inside[d] * DN(GAIN2) * w->faster[d];
+      if (kind == OF_DRIVE + DELAY) f = w->by_u[d] * w->faster[d], bend = w->stepped[d] * DN(GAIN2) * w->faster[d];
       if (kind == OF_DRIVE + DEAD) f = w->by_band[d];
       if (kind == OF_DRIVE + VOLTAGE) f = w->volt[d];
       if (kind == LIMIT) f = w->limit[d];
       if (kind == KP) f = w->by_gain[d];
-      if (kind == KD) f = w->inside[d] ? -w->rate[d] : 0, bend = w->inside[d] ? -1 : 0;
+      if (kind == KD) f = w->inside[d] ? -w->rate[d] : 0, bend = w->stepped[d] ? -1 : 0;
       double turn = 0;
       for (int k = 0; k < n; k++) turn += way[k] * w->moved[k];
       for (int k = 0; k < n; k++) {

@@ -16,7 +16,7 @@ from ..formats.export import load_model, write_model
 from ..rigid.manifold import neutral
 from ..rigid.model import RobotModel
 from .export import described, described_text, with_drives
-from .loop import Drives, Joints, Loop, Pairs
+from .loop import Drives, Joints, Loop, Pairs, acts_across
 from .reading import plain_joints
 from .task import extended_of
 
@@ -87,7 +87,7 @@ def _loop(content: Mapping[str, Any], robot: RobotModel) -> Loop:
         )
     return Loop(
         robot=robot,
-        drives=_drives(content["drives"], names),
+        drives=_drives(content["drives"], robot),
         joints=_joints(content, robot),
         start=np.asarray(content["start"], float) if "start" in content else neutral(robot),
         dt=np.float64(content["dt"]),
@@ -114,8 +114,8 @@ def _joints(content: Mapping[str, Any], robot: RobotModel) -> Joints:
     return Joints(**found)
 
 
-def _drives(content: Mapping[str, Any], names: tuple[str, ...]) -> Drives:
-    each = [*content.values()]
+def _drives(content: Mapping[str, Any], robot: RobotModel) -> Drives:
+    each, names = [*content.values()], robot.dof_names
     way = np.zeros((len(each), len(names)))
     for k, one in enumerate(each):
         for joint, gear in one["transmission"].items():
@@ -138,6 +138,7 @@ def _drives(content: Mapping[str, Any], names: tuple[str, ...]) -> Drives:
         names=tuple(content),
         activation=tuple(one["activation"] for one in each),
         early=tuple(bool(one["early"]) for one in each),
+        across=acts_across(robot, way),
     )
 
 
