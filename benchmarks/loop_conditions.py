@@ -2,13 +2,14 @@
 
     python benchmarks/loop_conditions.py --seeds 0 100 [--rare .03]
 
-Drawn are: a tree with branches (fixed or free base; hinges, slides, balls, several joints of one body, bodies without a
-joint), how placements and inertias are written (Euler angles, axes, quaternions, degrees, geoms, full inertias),
-classes of defaults, `ref` and springs, armature, damping, friction with its solref and solimp, limits, ranges of torques,
-options and flags, integrators, and actuators of every kind that is said to be simulated, at joints and fixed tendons,
-with gears, ranges, activations and delays. With `--rare` each thing that is said not to be simulated is drawn too, one
-by one. What is read must move as MuJoCo C moves the file, as `simulate` writes it, and as the exported `robot.xml` with
-its `callback.py` moves; what is not simulated must be told or refused. One line a case; at the end whatever is odd.
+Drawn are: a tree with branches (fixed or free base; hinges, slides, balls, several joints of one body, bodies without
+a joint), how placements and inertias are written (Euler angles, axes, quaternions, degrees, geoms, full inertias),
+classes of defaults, `ref` and springs, armature, damping, friction with its solref and solimp, limits, ranges of
+torques, options and flags, integrators, and actuators of every kind that is said to be simulated, at joints and fixed
+tendons, with gears, ranges, activations and delays. With `--rare` each thing that is said not to be simulated is
+drawn too, one by one. What is read must move as MuJoCo C moves the file, as `simulate` writes it, and as the exported
+`robot.xml` with its `callback.py` moves; what is not simulated must be told or refused. One line a case; at the end
+whatever is odd.
 """
 
 from __future__ import annotations

@@ -103,6 +103,14 @@ def test_set_points_at_uneven_times_are_held_or_joined_by_lines(interpolate: boo
     np.testing.assert_allclose(found["time"], now, rtol=0, atol=1e-9)
 
 
+def test_rows_at_twenty_milliseconds_give_rows_at_the_same_instants(tmp_path: Path):
+    """5 * .004 s is above .02 s by a rounding."""
+    written(tmp_path, TWO.replace('timestep="0.002"', 'timestep="0.004"'))
+    t = 5 * 0.004 * np.arange(30)
+    found = ran(tmp_path, saved(tmp_path / "commands.csv", time=t, a=0.2 * np.sin(t), b=0.0 * t))
+    np.testing.assert_allclose(found["time"], t, rtol=0, atol=1e-9)
+
+
 def test_a_recording_starts_where_it_started_and_is_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """As the held-out predictions of a run are: the same function gives the same motion, and its error is told."""
     loop = written(tmp_path, numbers=NUMBERS["all"])
