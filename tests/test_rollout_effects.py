@@ -19,7 +19,7 @@ from figaroh_jax.formats.export import write_model
 from figaroh_jax.rollouts import sensitivity
 from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.data import Run, Stretch, windows
-from figaroh_jax.rollouts.fit import standard_errors
+from figaroh_jax.rollouts.fit import contradicted_errors, fit, standard_errors
 from figaroh_jax.rollouts.loop import Pairs
 from figaroh_jax.rollouts.native import native
 from figaroh_jax.rollouts.parameters import Entry, put, values
@@ -152,6 +152,33 @@ def test_the_order_of_a_ripple_is_found(tmp_path: Path):
         error = errors[int(np.flatnonzero(found.last.free == entry)[0])]
         assert abs(found.last.theta[entry] - truth[name]) < 4 * error < 0.1 * abs(truth[name])
     assert search(setting(loop, runs, forbid=("torque_ripple",)), forbid=("torque_ripple",)).verdict == "unknown"
+
+
+@pytest.mark.parametrize("held", [1, 40])
+def test_intervals_count_noise_that_stays_from_row_to_row(tmp_path: Path, held: int):
+    """A servo in MuJoCo C read 24 times, with noise drawn anew in each row or held over 40, as by a coarse counter."""
+    text = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body pos="0 0 1">
+    <joint name="lift" axis="0 1 0" damping="0.4" armature="0.05" frictionloss="0.15"/>
+    <inertial pos=".15 0 .02" mass="1" diaginertia=".01 .02 .02"/></body></worldbody>
+    <actuator><position name="lift" joint="lift" kp="60" kv="2"/></actuator></mujoco>"""
+    (tmp_path / "servo.xml").write_text(text)
+    loop, _ = fj.load_loop(tmp_path / "servo.xml")
+    model, rows, rng = mujoco.MjModel.from_xml_string(text), 6000, np.random.default_rng(7)
+    data, t = mujoco.MjData(model), 0.002 * np.arange(rows)
+    u, q = 0.6 * np.sin(1.7 * t) + 0.25 * np.sin(4.1 * t + 1), np.zeros(rows)
+    for k in range(rows):
+        q[k], data.ctrl[0] = data.qpos[0], u[k]
+        mujoco.mj_step(model, data)
+    table, truth, off = (Entry("damping", (0,)), Entry("friction", (0,))), np.array([0.4, 0.15]), []
+    for _ in range(24):
+        noisy = q + 3e-4 * np.repeat(rng.standard_normal(rows // held), held)
+        run = Run("run", t, u[:, None], noisy[:, None], None)
+        cut = windows(loop, [run], [Stretch(0, 0, rows)], [np.array([3e-4])], 0.3)
+        (found,) = fit(loop, table, cut, truth[None], [[0, 1]], width=2, lanes=1)
+        off.append([(found.theta - truth) / errors(found, cut) for errors in (standard_errors, contradicted_errors)])
+    plain, told = np.sqrt(np.square(off).mean((0, 2)))
+    assert 0.7 < told < 1.4
+    assert told <= plain < 1.2 * told if held == 1 else plain > 3.0
 
 
 @pytest.mark.slow

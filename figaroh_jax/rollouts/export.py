@@ -193,7 +193,7 @@ def _with_start(root: Any, content: dict[str, Any]) -> None:
 
     MuJoCo sets the softness of friction and limits there. What the numbers of the joints mean stays as it was.
     """
-    start, moved = _starts(content), dict[str, float]()
+    start, moved = _starts(root, content), dict[str, float]()
     for body in root.iter("body"):
         joints = body.findall("joint")
         at = start.get(joints[0].get("name")) if len(joints) == 1 else None
@@ -222,20 +222,17 @@ def _with_start(root: Any, content: dict[str, Any]) -> None:
         follower.set("polycoef", _text(numbers.tolist()))
 
 
-def _starts(content: dict[str, Any]) -> dict[str, list[float]]:
-    """Where each joint starts; by its own name also where it has several coordinates."""
+def _starts(root: Any, content: dict[str, Any]) -> dict[str, list[float]]:
+    """Where each joint starts; by its own name also where it has several coordinates, as `base.vx` has."""
+    single = {joint.get("name") for joint in root.iter("joint")}
+    joints = [name if name in single else name.rsplit(".", 1)[0] for name in content["joints"]]
     found, at = dict[str, list[float]](), 0
-    for joint in dict.fromkeys(name.rsplit(".", 1)[0] if _part(name) else name for name in content["joints"]):
-        many = sum(name == joint or (_part(name) and name.rsplit(".", 1)[0] == joint) for name in content["joints"])
+    for joint in dict.fromkeys(joints):
+        many = joints.count(joint)
         many += many > 1  # a quaternion, or the cosine and sine of an angle
         found[joint] = content.get("start", [])[at : at + many]
         at += many
     return found
-
-
-def _part(name: str) -> bool:
-    """Whether a coordinate is one of several of its joint."""
-    return name.rsplit(".", 1)[-1] in ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
 def _vector(element: Any, word: str, default: np.ndarray) -> np.ndarray:

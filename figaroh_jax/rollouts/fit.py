@@ -18,7 +18,16 @@ from .native import native
 from .parameters import BOUNDS, Table, uncoupled
 from .sensitivity import Sums, Windows, linear_sums
 
-__all__ = ["Fit", "fit", "held_out", "refitted_without", "spread_of_recordings", "standard_errors", "start_of"]
+__all__ = [
+    "Fit",
+    "contradicted_errors",
+    "fit",
+    "held_out",
+    "refitted_without",
+    "spread_of_recordings",
+    "standard_errors",
+    "start_of",
+]
 
 _ITERATIONS = 40
 _PAIR = 2
@@ -29,6 +38,7 @@ _GROUPS, _REFITS = 6, 10  # of recordings that are left out, steps of each fit w
 _SETTLED, _RESTING = 1e-5, 10.0  # predicted share of the squares at which a fit without some recordings ends
 _OF_GAIN, _OF_REST = 0.02, 0.003  # shares of what a fit has gained and of what is left, where only its gain is asked
 _LEAST_FREEDOM = 2.0  # of an interval told by recordings
+_FEWEST_BLOCKS = 10  # of rows that tell how far they contradict each other
 _CLOSE = 0.02  # predicted decrease of the sum of whitened squares at which a fit ends
 
 
@@ -332,6 +342,13 @@ class System:
         spent = change @ self.hpp @ change + 2 * np.einsum("p,wpi,wi->", change, self.hps, s)
         return float(gain - spent - np.einsum("wi,wij,wj->", s, self.hss, s))
 
+    def scores(self, sums: Sums) -> np.ndarray:
+        """Gradient of the parameters of each block and window, (blocks, windows, parameters), starts solved for."""
+        size = 1e-12 * np.maximum(np.einsum("wii->w", self.hss), 1.0)
+        least = size[:, None, None] * np.eye(self.hss.shape[1])
+        inner = np.linalg.solve(self.hss + least, np.swapaxes(self.hps, 1, 2))
+        return sums.gradient[..., : self.m] - np.einsum("wip,bwi->bwp", inner, sums.gradient[..., self.m :])
+
     def covariance(self, fixed: np.ndarray) -> np.ndarray:
         """Of the parameters, the starts being unknown; infinite variance where nothing tells one."""
         size = 1e-12 * np.maximum(np.einsum("wii->w", self.hss), 1.0)
@@ -349,6 +366,26 @@ def standard_errors(found: Fit, data: Windows, level: float = 1.0) -> np.ndarray
     with np.errstate(invalid="ignore"):
         spread = np.diag(System(found.sums, data, found.start).covariance(found.free < 0))
         return np.sqrt(np.maximum(spread, 0.0) * level)
+
+
+def contradicted_errors(found: Fit, data: Windows, level: float = 1.0) -> np.ndarray:
+    """`standard_errors`, or what blocks of rows contradict each other by where that is more, (columns,).
+
+    An encoder's steps are no noise that each row draws anew. The scores of blocks, and of pairs of neighbours, stand
+    for the noise's (K.-Y. Liang and S. Zeger, "Longitudinal data analysis using generalized linear models", Biometrika
+    73, 1986), where there are enough of them.
+    """
+    errors, system = standard_errors(found, data, level), System(found.sums, data, found.start)
+    told = np.flatnonzero(np.isfinite(errors) & (found.free >= 0))
+    inner = system.covariance(found.free < 0)[np.ix_(told, told)]
+    scores = system.scores(found.sums)[..., told]
+    for many in (1, 2):
+        each = np.add.reduceat(scores, np.arange(0, len(scores), many), axis=0).reshape(-1, len(told))
+        count = int(each.any(axis=1).sum())
+        if count >= max(_FEWEST_BLOCKS, 2 * len(told)):
+            apart = np.square(each @ inner).sum(0) * count / (count - len(told))
+            errors[told] = np.maximum(errors[told], np.sqrt(apart))
+    return errors
 
 
 def refitted_without(

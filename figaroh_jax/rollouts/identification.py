@@ -17,7 +17,7 @@ from ..results import Trace
 from .bodies import EFFECT, consistent, fitted_links, told_alone
 from .creep import fitted_with_both
 from .data import Run, as_recorded
-from .fit import Fit, System, fit, standard_errors
+from .fit import Fit, System, contradicted_errors, fit
 from .loop import Loop
 from .own import is_own
 from .parameters import BOUNDS, OF_DRIVES, TEN, TILT, put, unit_of
@@ -67,7 +67,8 @@ def identify_rollout_task(
     """Fit the baseline of a task of commands and positions: friction, armature, gains, delay and whatever it names.
 
     The baseline's `effects` may name any rollout effect at a joint. Every number has a standard deviation from the
-    exact sensitivities, inflated by the residual's power, and a verdict: identified, unidentifiable, or on its bound.
+    exact sensitivities, inflated by the residual's power or by how far parts of the data contradict each other, and a
+    verdict: identified, unidentifiable, or on its bound.
     """
     progress("reading", 0.0)
     loop, runs, notes = read_rollouts(task)
@@ -154,7 +155,7 @@ def _result(
     correlation = covariance[np.ix_(told, told)] / np.outer(size[told], size[told]) if told else np.zeros((0, 0))
     singular = np.linalg.svd(correlation, compute_uv=False) if told else np.array([1.0])
     names = [_expression(here, int(first.free[k])) for k in range(len(first.free)) if first.free[k] >= 0]
-    errors = standard_errors(first, here.data, level)
+    errors = contradicted_errors(first, here.data, level)
     parameters = [_parameter(here, first, k, float(errors[k])) for k in free]
     return {
         "rank": sum(p["status"] == "identified" for p in parameters),

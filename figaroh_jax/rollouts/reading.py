@@ -275,7 +275,7 @@ def _left_out(mj: Any) -> list[str]:
     if scheme == "rk4" and hasattr(mj, "actuator_delay") and mj.actuator_delay.any():
         notes.append("what a late command does between the stages of RK4")
     if disabled(mj, "REFSAFE") and _stiff(mj):
-        notes.append("softness of less than two time steps (option flag refsafe is disabled)")
+        notes.append("constraints stiffer than two time steps (option flag refsafe is disabled)")
     if scheme == "euler" and disabled(mj, "EULERDAMP") and mj.dof_damping.any():
         notes.append("explicit damping (option flag eulerdamp is disabled)")
     if mj.opt.density or mj.opt.viscosity:
@@ -292,7 +292,7 @@ def _left_out(mj: Any) -> list[str]:
 
 
 def _stiff(mj: Any) -> bool:
-    """Whether dry friction or a limit is softer in the file's words than it may be where MuJoCo is safe."""
+    """Whether dry friction or a limit is stiffer than MuJoCo takes it while `refsafe` is on."""
     softness = np.concatenate([mj.dof_solref[:, 0][mj.dof_frictionloss > 0], mj.jnt_solref[:, 0][mj.jnt_limited > 0]])
     return bool(((softness > 0) & (softness < 2 * mj.opt.timestep)).any())
 
