@@ -344,17 +344,18 @@ class System:
 
     def scores(self, sums: Sums) -> np.ndarray:
         """Gradient of the parameters of each block and window, (blocks, windows, parameters), starts solved for."""
+        inner = self._by_starts()
+        return sums.gradient[..., : self.m] - np.einsum("wip,bwi->bwp", inner, sums.gradient[..., self.m :])
+
+    def _by_starts(self) -> np.ndarray:
+        """How the best starts of the windows follow the parameters, (windows, states, parameters)."""
         size = 1e-12 * np.maximum(np.einsum("wii->w", self.hss), 1.0)
         least = size[:, None, None] * np.eye(self.hss.shape[1])
-        inner = np.linalg.solve(self.hss + least, np.swapaxes(self.hps, 1, 2))
-        return sums.gradient[..., : self.m] - np.einsum("wip,bwi->bwp", inner, sums.gradient[..., self.m :])
+        return np.linalg.solve(self.hss + least, np.swapaxes(self.hps, 1, 2))
 
     def covariance(self, fixed: np.ndarray) -> np.ndarray:
         """Of the parameters, the starts being unknown; infinite variance where nothing tells one."""
-        size = 1e-12 * np.maximum(np.einsum("wii->w", self.hss), 1.0)
-        least = size[:, None, None] * np.eye(self.hss.shape[1])
-        inner = np.linalg.solve(self.hss + least, np.swapaxes(self.hps, 1, 2))
-        schur = self.hpp - np.einsum("wpi,wiq->pq", self.hps, inner)
+        schur = self.hpp - np.einsum("wpi,wiq->pq", self.hps, self._by_starts())
         keep = ~fixed & (np.diag(schur) > 0)
         answer = np.diag(np.full(self.m, np.inf))
         answer[np.ix_(keep, keep)] = np.linalg.pinv(schur[np.ix_(keep, keep)], rcond=1e-14, hermitian=True)

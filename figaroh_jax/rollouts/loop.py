@@ -322,9 +322,8 @@ def _drive(loop: Loop, angle: Array, v: Array, control: Array) -> _Drive:
     low, high = (jnp.asarray(drives.force_range)[:, k, None] for k in (0, 1))
     torque = times(way.T[..., None], jnp.clip(force, low, high))
     least, most = (jnp.asarray(loop.joints.torque_range)[:, k, None] for k in (0, 1))
-    alone = (way != 0) & (
-        (way != 0).sum(1, keepdims=True) == 1
-    )  # MuJoCo asks the joint of a drive, not those of a tendon
+    on = way != 0  # MuJoCo asks the joint of a drive, not those of a tendon
+    alone = on & (on.sum(1, keepdims=True) == 1)
     held = (alone[..., None] & ((torque < least) | (torque > most))).any(1)
     free = (force > low) & (force < high) & ~held
     return _Drive(jnp.clip(torque, least, most), jnp.where(free, slope, 0.0))
@@ -410,12 +409,8 @@ def acts_across(robot: RobotModel, transmission: np.ndarray) -> bool:
 
 def _together(robot: RobotModel) -> np.ndarray:
     """1 where one of two coordinates moves what the other one is on, (nv, nv): the places of the inertia matrix."""
-    over = ancestors(robot.joints)
-    every = (over + over.T) > 0
-    found = np.zeros((robot.nv, robot.nv))
-    for dof in zip(robot.dofs.joint, robot.dofs.column, strict=True):
-        for other in zip(robot.dofs.joint, robot.dofs.column, strict=True):
-            found[dof[1], other[1]] = max(found[dof[1], other[1]], float(every[dof[0], other[0]]))
+    over, dofs, found = ancestors(robot.joints), robot.dofs, np.zeros((robot.nv, robot.nv))
+    np.maximum.at(found, np.ix_(dofs.column, dofs.column), (over + over.T > 0)[np.ix_(dofs.joint, dofs.joint)])
     return found
 
 
@@ -570,7 +565,7 @@ def _inertial(loop: Loop, state: State, bias: Array, *accelerations: Array) -> l
 def _moved(loop: Loop, state: State, a: Array, activation: Array) -> State:
     """Semi-implicit: the new velocity carries the position; `a` is in MuJoCo's axes at free joints."""
     v = _turned(loop, state.q, state.v + loop.dt * a, rotate)
-    q = _carried(loop, state.q, loop.dt * v)
+    q = _stepped(loop, state.q, loop.dt * v)
     v = _turned(loop, q, v, rotate_back)
     return State(q, v, _remembered(loop, state, v, activation))
 
@@ -584,19 +579,16 @@ def _turned(loop: Loop, q: Array, v: Array, turn: Any) -> Array:
     return v
 
 
-def _carried(loop: Loop, q: Array, step: Array) -> Array:
+def _stepped(loop: Loop, q: Array, step: Array) -> Array:
     """The position after a step, whose linear part at free joints is along the world's axes."""
     if loop.robot.nq == loop.robot.nv:
         return q + step
-    own = step
-    for joint in loop.robot.joints:
-        if joint.kind == "free":
-            own = own.at[joint.coordinate : joint.coordinate + 3].set(0.0)
-    after = integrate(loop.robot, q.T, own.T).T
+    own, world = step, jnp.zeros_like(q)
     for joint, at in zip(loop.robot.joints, loop.robot.dofs.positions, strict=True):
         if joint.kind == "free":
-            after = after.at[at.start : at.start + 3].add(step[joint.coordinate : joint.coordinate + 3])
-    return after
+            k = joint.coordinate
+            own, world = own.at[k : k + 3].set(0.0), world.at[at.start : at.start + 3].set(step[k : k + 3])
+    return integrate(loop.robot, q.T, own.T).T + world
 
 
 def _remembered(loop: Loop, state: State, v: Array, activation: Array) -> Array:
@@ -655,7 +647,7 @@ def _along(loop: Loop, way: Array, speed: Array) -> Array:
 def _stage(loop: Loop, state: State, start: Array, rate: State, share: float) -> State:
     """The state after a share of a step at this rate; `start` is its velocity in MuJoCo's axes."""
     q, v, act = (share * loop.dt * r for r in rate)
-    q = _carried(loop, state.q, q)
+    q = _stepped(loop, state.q, q)
     return State(q, _turned(loop, q, start + v, rotate_back), state.act + act)
 
 
