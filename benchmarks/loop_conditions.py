@@ -1,15 +1,15 @@
 """MJCF files as strangers write them, moved by commands: `figaroh-jax simulate` and `export` against MuJoCo C.
 
-    python benchmarks/loop_conditions.py --seeds 0 100 [--rare .03]
+    python benchmarks/loop_conditions.py --seeds 0 100 [--rare .03] | --files FOLDER [FOLDER ...]
 
-Drawn are: a tree with branches (fixed or free base; hinges, slides, balls, several joints of one body, bodies without
-a joint), how placements and inertias are written (Euler angles, axes, quaternions, degrees, geoms, full inertias),
-classes of defaults, `ref` and springs, armature, damping, friction with its solref and solimp, limits, ranges of
-torques, options and flags, integrators, and actuators of every kind that is said to be simulated, at joints and fixed
-tendons, with gears, ranges, activations and delays. With `--rare` each thing that is said not to be simulated is
-drawn too, one by one. What is read must move as MuJoCo C moves the file, as `simulate` writes it, and as the exported
-`robot.xml` with its `callback.py` moves; what is not simulated must be told or refused. One line a case; at the end
-whatever is odd.
+With `--files` every MJCF in those folders is asked, its contacts switched off in MuJoCo. Else drawn are: a tree with
+branches (fixed or free base; hinges, slides, balls, several joints of one body, bodies without a joint), how placements
+and inertias are written (Euler angles, axes, quaternions, degrees, geoms, full inertias), classes of defaults, `ref`
+and springs, armature, damping, friction with its solref and solimp, limits, ranges of torques, options and flags,
+integrators, and actuators of every kind that is said to be simulated, at joints and fixed tendons, with gears, ranges,
+activations and delays. With `--rare` each thing that is said not to be simulated is drawn too, one by one. What is read
+must move as MuJoCo C moves the file, as `simulate` writes it, and as the exported `robot.xml` with its `callback.py`
+moves; what is not simulated must be told or refused. One line a case; at the end whatever is odd.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import mujoco
 import numpy as np
 
@@ -52,6 +53,7 @@ NEVER = {  # what is not simulated, and a word with which it is told or refused
     "actuation": "actuation",
     "ball limit": "several axes",
     "ball spring": "several axes",
+    "free friction": "free joint",
 }
 
 
@@ -59,11 +61,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", nargs=2, type=int, default=[0, 100], metavar=("FIRST", "END"))
     parser.add_argument("--rare", type=float, default=0.03, help="chance of each thing that is not simulated")
+    parser.add_argument("--files", nargs="+", type=Path, metavar="FOLDER", help="of MJCF files, in place of drawn ones")
+    parser.add_argument("--part", nargs=2, type=int, default=[0, 1], metavar=("K", "N"), help="every N-th file from K")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="write the files there")
     args = parser.parse_args()
     count: collections.Counter[str] = collections.Counter()
     odd = []
-    for seed in range(*args.seeds):
+    for file in _files(args.files or [])[args.part[0] :: args.part[1]]:
+        mark, line = asked(file)
+        count[mark] += 1
+        print(f"{file}: {mark}  {line}", flush=True)
+        if mark in ("odd", "error"):
+            odd.append(f"{file}: {mark}  {line}")
+    for seed in range(*(args.seeds if not args.files else (0, 0))):
         text, told, rare = drawn(np.random.default_rng([seed, 78]), np.random.default_rng([seed, 80]), args.rare)
         if args.keep:
             args.keep.mkdir(parents=True, exist_ok=True)
@@ -101,14 +111,48 @@ def answered(text: str, rare: list[str], seed: int) -> tuple[str, str]:
         return compared(model, loop, folder, seed)
 
 
+def _files(folders: list[Path]) -> list[Path]:
+    """Files with a robot or a scene in MJCF; what others include is none."""
+    found = [file for folder in folders for file in sorted(folder.rglob("*.xml"))]
+    return [file for file in found if b"<mujoco" in (text := file.read_bytes()) and b"<mujocoinclude" not in text]
+
+
+def asked(file: Path) -> tuple[str, str]:
+    """What became of a stranger's file, in a word and in a line."""
+    with tempfile.TemporaryDirectory() as name, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.simplefilter("ignore", UserWarning)  # MuJoCo's, of words that it is going to forget
+        try:
+            spec = MADE.MjSpec.from_file(str(file))
+            spec.option.disableflags |= int(MADE.mjtDisableBit.mjDSBL_CONTACT)
+            model = spec.compile()
+        except ValueError as error:
+            return "no file", " ".join(str(error).split())[:120]
+        try:
+            loop, notes = fj.load_loop(file)
+        except InputError as error:
+            return "refused", " ".join(str(error).removeprefix(f"{file}: ").split())[:150]
+        except Exception as error:  # whatever it is, it is found
+            return "error", f"{type(error).__name__}: {' '.join(str(error).split())[:150]}"
+        if others := [note for note in notes if not note.startswith("contacts")]:
+            return "told", "; ".join(others)[:150]
+        if not model.nu:
+            return "no drive", ""
+        wider = np.array([-0.001, 0.001])  # where a robot starts at a limit rounding decides whether that acts
+        model.jnt_range[model.jnt_limited > 0] += wider
+        loop = eqx.tree_at(lambda one: one.joints.limit, loop, loop.joints.limit + wider)
+        return compared(model, loop, Path(name), 0)
+
+
 def compared(model: Any, loop: Any, folder: Path, seed: int) -> tuple[str, str]:
     """MuJoCo C with the file, the motion that `simulate` writes, and MuJoCo C with what `export` writes."""
     rng, dt = np.random.default_rng([seed, 79]), float(model.opt.timestep)
-    t = EACH * dt * np.arange(ROWS)
+    each = max(1, min(EACH, int(0.02 / dt + 1e-6)))  # rows further apart than that are set points
+    t = each * dt * np.arange(ROWS)
     size, rate, phase = rng.uniform(0.2, 0.8, model.nu), rng.uniform(3.0, 12.0, model.nu), rng.uniform(0, 6, model.nu)
     u = size * np.sin(t[:, None] * rate + phase)
     u *= np.minimum(1.0, np.arange(ROWS) / 8)[:, None]  # MuJoCo's late drives see zero before the first step
-    steps = np.repeat(u, EACH, axis=0)
+    steps = np.repeat(u, each, axis=0)
     theirs = moved(model, lambda data, row: (data.ctrl.__setitem__(slice(None), row), MADE.mj_step(model, data)), steps)
     if not np.isfinite(theirs).all() or np.abs(theirs).max() > 20:
         return "unstable", ""
@@ -126,9 +170,9 @@ def compared(model: Any, loop: Any, folder: Path, seed: int) -> tuple[str, str]:
         with np.load(folder / "out" / "simulation.npz") as found:
             ours = found["position"]
         # quaternions of balls and free bases stand x, y, z, w; MuJoCo's w, x, y, z
-        want, places = theirs[::EACH], order(model, loop.robot)
+        want, places = theirs[::each], order(model, loop.robot)
         away = np.abs(aligned(ours, loop.robot) - aligned(want[:, places], loop.robot)).max()
-        exported = replayed(run / "model", folder / "export", steps, names, model, loop.robot)
+        exported = replayed(run / "model", folder / "export", steps, loop.robot)[::each]
         apart = np.abs(exported - aligned(want[:, places], loop.robot)).max()
     except InputError as error:
         return "odd", " ".join(str(error).split())[-200:]
@@ -150,7 +194,9 @@ def order(model: Any, robot: Any) -> list[int]:
     """Where the numbers of our position stand in MuJoCo's."""
     places = []
     for joint in robot.joints:
-        at, many = int(model.joint(joint.name).qposadr[0]), {"free": 7, "spherical": 4}.get(joint.kind, 1)
+        many = {"free": 7, "spherical": 4}.get(joint.kind, 1)
+        nameless = joint.kind == "free" and joint.name not in [model.joint(k).name for k in range(model.njnt)]
+        at = int(model.jnt_qposadr[model.jnt_type == 0][0] if nameless else model.joint(joint.name).qposadr[0])
         if many > 1:
             quaternion = at + many - 4
             places += [*range(at, quaternion), quaternion + 1, quaternion + 2, quaternion + 3, quaternion]
@@ -171,7 +217,7 @@ def aligned(position: np.ndarray, robot: Any) -> np.ndarray:
     return found
 
 
-def replayed(run: Path, out: Path, steps: np.ndarray, names: list[str], original: Any, robot: Any) -> np.ndarray:
+def replayed(run: Path, out: Path, steps: np.ndarray, robot: Any) -> np.ndarray:
     """MuJoCo C with the files of `export --for mujoco --out`, as a user reads them."""
     with contextlib.redirect_stdout(io.StringIO()):
         if command_line(["export", str(run), "--for", "mujoco", "--out", str(out)]):
@@ -182,7 +228,7 @@ def replayed(run: Path, out: Path, steps: np.ndarray, names: list[str], original
     spec.loader.exec_module(written)
     model = MADE.MjModel.from_xml_path(str(out / "robot.xml"))
     rest = written.Rest(model, out / "loop.json")
-    return aligned(moved(model, rest.step, steps)[::EACH][:, order(model, robot)], robot)
+    return aligned(moved(model, rest.step, steps)[:, order(model, robot)], robot)
 
 
 def drawn(rng: np.random.Generator, apart: np.random.Generator, rare: float) -> tuple[str, str, list[str]]:
@@ -278,8 +324,9 @@ def _body(
     child = f' childclass="{rng.choice(["heavy", "light"])}"' if rng.random() < 0.2 else ""
     head = f'<body name="b{k}" pos="{_numbers(rng.normal(0, 0.2, 3))}"{_turned(rng, degree)}{child}{gravcomp}>'
     draw, found = rng.random(), ""
-    if k == 0 and draw < 0.12:
-        found = '<freejoint name="base"/>'
+    if k == 0 and (draw < 0.12 or "free friction" in odd):
+        loss = ' frictionloss=".1"' if "free friction" in odd else ""
+        found = f'<joint name="base" type="free"{loss}/>' if loss or draw > 0.06 else '<freejoint name="base"/>'
         joints.append(("base", "free"))
     elif draw > 0.93 or "ball limit" in odd or "ball spring" in odd:
         more = ' range="0 1" limited="true"' if "ball limit" in odd else ""

@@ -104,6 +104,24 @@ def test_a_body_with_several_joints_is_a_chain_with_massless_links(tmp_path: Pat
     assert model.effort_limit[model.joint_index("wrist")] == 7
 
 
+def test_a_joint_may_have_the_name_of_a_body(tmp_path: Path) -> None:
+    """Of one that is fixed and not its own: MuJoCo keeps the names of joints and bodies apart."""
+    mass = '<inertial pos=".1 0 0" mass="1" diaginertia=".1 .1 .1"/>'
+    inner = f'<body name="inner" pos="0 .3 0"><joint name="outer" axis="0 1 0"/>{mass}</body>'
+    text = f'<mujoco><worldbody><body name="outer" pos="0 0 1">{mass}{inner}</body></worldbody></mujoco>'
+    path = written(text, tmp_path)
+    model, theirs = load_mjcf(path), mujoco.MjModel.from_xml_path(str(path))
+    assert model.joint_names == ("outer",)
+    data = mujoco.MjData(theirs)
+    data.qpos[:] = 0.4
+    mujoco.mj_forward(theirs, data)
+    for body in ("outer", "inner"):
+        found = fj.frame_placement(model, np.array([0.4]), body)
+        np.testing.assert_allclose(found[:3, 3], data.body(body).xpos, rtol=0, atol=1e-12)
+    torque = inverse_dynamics(model, np.array([0.4]), np.zeros(1), np.zeros(1))
+    np.testing.assert_allclose(torque, data.qfrc_bias, rtol=0, atol=1e-12)
+
+
 def test_a_linear_coupling_is_a_mimic_joint_and_motors_bound_the_torque(tmp_path: Path) -> None:
     model = load_mjcf(written(robots.GRIPPER, tmp_path))
     assert model.joint_names == ("shoulder", "elbow", "left")

@@ -65,7 +65,7 @@ def test_the_exported_callback_moves_mujoco_as_the_loop_moves(which: str, tmp_pa
     np.testing.assert_allclose(ours, seen, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("root", ["", "<freejoint name='base'/>"])
+@pytest.mark.parametrize("root", ["", "<joint name='base' type='free' armature='.2' damping='.1' frictionloss='.05'/>"])
 def test_the_exported_files_start_and_move_as_the_original(root: str, tmp_path: Path):
     """Joints whose zero is not where they start, a ball and a free base: MuJoCo C with both files."""
     text = HAND.replace("{root}", root).replace("{integrator}", "implicitfast").replace("<body>", '<body pos="0 0 1">')

@@ -143,7 +143,7 @@ HAND = """<mujoco><compiler angle="radian"/><option timestep="0.004" integrator=
 
 
 @pytest.mark.parametrize("integrator", ["implicitfast", "RK4"])
-@pytest.mark.parametrize("root", ["", "<freejoint/>"])
+@pytest.mark.parametrize("root", ["", '<joint type="free" armature=".2" damping=".1"/>'])
 def test_a_hand_is_mujocos(tmp_path: Path, root: str, integrator: str):
     """A drive of fingers on two branches, one at the end of its torque range, beside a ball and a free base."""
     path = written(tmp_path, HAND.replace("{root}", root).replace("{integrator}", integrator))
@@ -166,6 +166,7 @@ def test_a_hand_is_mujocos(tmp_path: Path, root: str, integrator: str):
         ('<fixed name="grip">', '<fixed name="grip" range="-1 1">', "limits of tendons"),
         ('type="ball"', 'type="ball" stiffness="2"', "the spring of joint 'tip'"),
         ('type="ball"', 'type="ball" range="0 1"', "the limit of joint 'tip'"),
+        ("<body>", '<body><joint type="free" frictionloss=".1"/>', "along the world's axes"),
         ('kp="9"', 'kp="9" delay=".01" nsample="4"', "between the stages of RK4"),
         ('contact="disable"', 'contact="disable" refsafe="disable"', "refsafe"),
     ],

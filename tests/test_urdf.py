@@ -117,6 +117,23 @@ def test_what_a_joint_says_twice_counts_once_and_is_told(tmp_path: Path) -> None
     assert load_extended(file).notes == ("the second <origin> of joint 'turn' (line 1): the first counts",)
 
 
+def test_what_a_link_weighs_twice_counts_once_and_is_told(tmp_path: Path) -> None:
+    """As for Pinocchio; the fingers of a published robot have two."""
+    second = '<inertial><mass value="7"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+    twice = robots.LINKS[1].replace("</inertial>", f"</inertial>{second}")
+    text = robot(robots.LINKS[0], twice, joint("turn", "base", "a", "continuous"))
+    model, theirs = robots.load(text, tmp_path), pin.buildModelFromXML(text)
+    np.testing.assert_allclose(model.inertia[:, 0], [one.mass for one in theirs.inertias[1:]], rtol=1e-15)
+    (file,) = tmp_path.glob("*.urdf")
+    assert load_extended(file).notes == ("the second <inertial> of link 'a' (line 1): the first counts",)
+
+
+@pytest.mark.parametrize("version", ["0.0", "1.1", "2.0"])
+def test_a_version_of_a_file_in_the_declaration_does_not_matter(version: str, tmp_path: Path) -> None:
+    """Files of a published quadruped have `<?xml version="0.0" ?>`, which readers of XML refuse and others do not."""
+    assert robots.load(f'<?xml version="{version}" ?>\n{robots.ARM}', tmp_path).nv == 2
+
+
 def test_meshes_are_never_looked_for(tmp_path: Path) -> None:
     mesh = '<visual><geometry><mesh filename="package://nowhere/a.dae"/></geometry></visual>'
     text = robots.ARM.replace('<link name="a">', f'<link name="a">{mesh}{mesh.replace("visual", "collision")}')

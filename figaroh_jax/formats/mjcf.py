@@ -290,7 +290,10 @@ def mjcf_parts(mj: Any, root: Root | None) -> tuple[list[LinkPart], list[JointPa
             joints.append(_joint(mj, j, names[j], (carrier, link), pose, followers.get(names[j])))
             carrier, pose = link, translation(-mj.jnt_pos[j])
         if not own:
-            joints.append(JointPart(bodies[b], "fixed", carrier, bodies[b], pose, np.zeros(3)))
+            name = bodies[b]
+            if name in names:  # MuJoCo's joints may have the names of its bodies
+                name = _unused(f"{name}_fixed", [*names, *bodies])
+            joints.append(JointPart(name, "fixed", carrier, bodies[b], pose, np.zeros(3)))
             pose = np.eye(4)
         about_body = inertia.transform(
             inertia.from_com(mj.body_mass[b], np.zeros(3), np.diag(mj.body_inertia[b])),

@@ -47,8 +47,11 @@ _NUMBERS = {  # element: attributes, how many numbers each holds, which must be 
 }
 _REQUIRED = ("mass", "inertia")  # elements of which no attribute may be left out
 _MAY_BE_INFINITE = ("limit",)
-_ONCE = {"link": ("inertial",), "inertial": ("origin", "mass", "inertia")}  # a second one contradicts the first
-_OF_A_JOINT = ("origin", "parent", "child", "axis", "limit", "mimic", "dynamics")  # the first counts, as in urdfdom
+_ONCE = {"inertial": ("origin", "mass", "inertia")}  # a second one contradicts the first
+_FIRST = {  # of these the first counts, as in urdfdom
+    "link": ("inertial",),
+    "joint": ("origin", "parent", "child", "axis", "limit", "mimic", "dynamics"),
+}
 _ROUNDED = 1e-6  # kg m^2; the inertias of small parts are often rounded to nonsense below this
 
 
@@ -114,13 +117,13 @@ def urdf_dynamics(path: str | Path) -> dict[str, tuple[float, float]]:
 
 
 def said_twice(path: str | Path) -> tuple[str, ...]:
-    """What the file says of a joint more than once; the first counts, as it does for other readers of URDF."""
-    joints = read_xml(path, "robot").iterchildren("joint")
-    counts = ((joint, tag, len(joint.findall(tag))) for joint in joints for tag in _OF_A_JOINT)
+    """What the file says of a link or a joint more than once; the first counts, as for other readers of URDF."""
+    parts = read_xml(path, "robot").iterchildren(*_FIRST)
+    counts = ((part, tag, len(part.findall(tag))) for part in parts for tag in _FIRST[part.tag])
     return tuple(
-        f"{'the second' if count == 2 else f'{count - 1} more'} <{tag}> of joint '{joint.get('name')}' (line"
-        f" {joint.findall(tag)[1].sourceline}): the first counts"
-        for joint, tag, count in counts
+        f"{'the second' if count == 2 else f'{count - 1} more'} <{tag}> of {part.tag} '{part.get('name')}' (line"
+        f" {part.findall(tag)[1].sourceline}): the first counts"
+        for part, tag, count in counts
         if count > 1
     )
 

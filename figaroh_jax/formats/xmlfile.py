@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from .files import read_file
 __all__ = ["as_text", "find_in_packages", "read_xml"]
 
 _PACKAGE = "package:/"  # a Path keeps one slash of the two
+_VERSION = re.compile(rb"""\A(<\?xml\s+version\s*=\s*["'])[\d.]+(["'])""")
 _LARGEST = 20_000_000  # bytes; robot models without their meshes stay far below
 
 
@@ -67,6 +69,7 @@ def find_in_packages(path: str | Path, packages: Sequence[str | Path]) -> Path:
 def _read(path: Path) -> bytes:
     data = read_file(path, f"{path}", "a robot model", _LARGEST, (".urdf", ".xml", ".mjcf"))
     data = data.lstrip()  # some files begin with an empty line, which XML forbids
+    data = _VERSION.sub(rb"\g<1>1.0\2", data)  # others have a version of their own there: 0.0, 2.0
     if not data:
         raise InputError(f"{path}: the file is empty; a robot model is expected")
     if b"\0" in data:

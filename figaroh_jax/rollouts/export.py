@@ -17,6 +17,7 @@ from ..effects.base import Effect
 from ..errors import InputError, nearest
 from ..formats.xmlfile import read_xml
 from ..results import finite
+from ..rigid.model import DOF_NAMES
 from .loop import STIFFEST, Loop
 from .parameters import UNITS
 
@@ -118,6 +119,7 @@ def with_drives(file: Path, content: dict[str, Any]) -> str:
     option.set("integrator", names[content["integrator"]])
     option.set("iterations", str(_ITERATIONS[0]))
     option.set("ls_iterations", str(_ITERATIONS[1]))
+    _with_free_joints(root, content)
     _with_limits(root, content)
     _with_start(root, content)
     for old in root.findall("actuator"):
@@ -164,6 +166,16 @@ def _way(root: Any, name: str, drive: dict[str, Any]) -> dict[str, str]:
     for joint, share in way.items():
         etree.SubElement(fixed, "joint", joint=joint, coef=f"{share:.9g}")
     return {"tendon": called}
+
+
+def _with_free_joints(root: Any, content: dict[str, Any]) -> None:
+    """What acts along and about the axes of free joints: the loop's axes are MuJoCo's, those of effects are not."""
+    words = {"armature": "armature", "damping": "damping", "frictionloss": "friction"}
+    for joint in root.iterfind(".//joint[@type='free']"):
+        axes = [content["joints"].get(f"{joint.get('name')}{axis}", {}) for axis in DOF_NAMES["free"]]
+        for word, number in words.items():
+            if len(values := {one.get(number) for one in axes}) == 1 and (value := values.pop()):
+                joint.set(word, _text([value]))
 
 
 def _with_limits(root: Any, content: dict[str, Any]) -> None:

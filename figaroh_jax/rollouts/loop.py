@@ -369,8 +369,9 @@ def _smooth(loop: Loop, state: State, u: Array, weight: Array) -> _Smooth:
         more = own.acting(loop.effects, loop.robot, q, v, bias, drive.torque, memory)
         torque, level = torque - more.torque, more.level
     rows = _rows(loop, angle, v, drive.torque, bias, weight, level)
-    rate = jnp.concatenate([rate, jnp.zeros_like(memory)])
-    return _Smooth(torque, bias, slope, _next_activation(loop, act, rate[: len(u)]), rows, _shift(loop, v), rate)
+    rate, shift = jnp.concatenate([rate, jnp.zeros_like(memory)]), _shift(loop, v)
+    torque = torque - jnp.asarray(loop.joints.armature)[:, None] * shift  # a free joint's acts in MuJoCo's axes
+    return _Smooth(torque, bias, slope, _next_activation(loop, act, rate[: len(u)]), rows, shift, rate)
 
 
 def _resistance(loop: Loop, slope: Array) -> Array:

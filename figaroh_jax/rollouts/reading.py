@@ -240,6 +240,8 @@ def _mjcf_joints(mj: Any, robot: RobotModel) -> tuple[Joints, tuple[str, ...]]:
             notes.append(f"the spring of joint '{joint.name}', which has several axes")
         if mj.jnt_limited[j] and not (disabled(mj, "LIMIT") or disabled(mj, "CONSTRAINT")):
             notes.append(f"the limit of joint '{joint.name}', which has several axes")
+        if joint.kind == "free" and own.friction[joint.coordinate]:
+            notes.append(f"that the dry friction of free joint '{joint.name}' acts along the world's axes, not its own")
     return own, (*notes, *_left_out(mj))
 
 
