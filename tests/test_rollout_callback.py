@@ -8,7 +8,7 @@ import equinox as eqx
 import mujoco as engine
 import numpy as np
 import pytest
-from test_rollouts import HAND
+from test_rollouts import HAND, explicit
 
 from figaroh_jax.formats.export import write_model
 from figaroh_jax.jobs.export import export_loop
@@ -65,10 +65,15 @@ def test_the_exported_callback_moves_mujoco_as_the_loop_moves(which: str, tmp_pa
     np.testing.assert_allclose(ours, seen, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("root", ["", "<joint name='base' type='free' armature='.2' damping='.1' frictionloss='.05'/>"])
-def test_the_exported_files_start_and_move_as_the_original(root: str, tmp_path: Path):
+FREE = "<joint name='base' type='free' armature='.2' damping='.1' frictionloss='.05'/>"
+
+
+@pytest.mark.parametrize(("root", "integrator"), [("", "implicitfast"), (FREE, "explicit")])
+def test_the_exported_files_start_and_move_as_the_original(root: str, integrator: str, tmp_path: Path):
     """Joints whose zero is not where they start, a ball and a free base: MuJoCo C with both files."""
-    text = HAND.replace("{root}", root).replace("{integrator}", "implicitfast").replace("<body>", '<body pos="0 0 1">')
+    text = HAND.replace("{root}", root).replace("<body>", '<body pos="0 0 1">')
+    text = explicit(text.replace("{integrator}", "Euler")) if integrator == "explicit" else text
+    text = text.replace("{integrator}", integrator)
     (tmp_path / "arm.xml").write_text(text)
     loop, _ = load_loop(tmp_path / "arm.xml")
     write_model(extended_of(loop), tmp_path / "model")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from generators import servo_arm6
 from scipy.linalg import toeplitz
-from test_rollouts import chain, mujoco_c, waves, written
+from test_rollouts import chain, explicit, mujoco_c, waves, written
 
 from figaroh_jax.rollouts import sensitivity
 from figaroh_jax.rollouts.alone import alone, carried_by
@@ -31,10 +31,11 @@ LIMITS = 'range="-.15 .2" limited="true" margin=".01"'
 WEAK = 'actuatorfrcrange="-12 9"'  # N m of all drives of a joint together
 
 
-@pytest.mark.parametrize("integrator", ["implicitfast", "Euler"])
+@pytest.mark.parametrize("integrator", ["implicitfast", "Euler", "explicit"])
 @pytest.mark.parametrize("more", ["", LIMITS, WEAK])
 def test_seven_joints_with_friction_and_limits_are_mujocos(tmp_path: Path, integrator: str, more: str):
-    path = written(tmp_path, chain(7, integrator, more))
+    text = chain(7, integrator, more) if integrator != "explicit" else explicit(chain(7, "Euler", more))
+    path = written(tmp_path, text)
     loop, _ = load_loop(path)
     command = waves(2500, 0.002, 7, 0.5)
     truth, rates = mujoco_c(path, command)
@@ -98,10 +99,12 @@ def arm(folder: Path) -> tuple[Loop, Run]:
     return loop, Run("run", r["t"], r["u"], r["q"], None)
 
 
-@pytest.mark.parametrize("law", ["soft", "hard"])
-def test_derivatives_of_an_arm_are_those_of_differences(tmp_path: Path, law: str):
+@pytest.mark.parametrize(
+    ("law", "integrator"), [("soft", "implicitfast"), ("hard", "implicitfast"), ("soft", "explicit")]
+)
+def test_derivatives_of_an_arm_are_those_of_differences(tmp_path: Path, law: str, integrator: str):
     loop, run = arm(tmp_path)
-    loop = dataclasses.replace(loop, law=law)
+    loop = dataclasses.replace(loop, law=law, integrator=integrator)
     data = windows(loop, [run], [Stretch(0, 100, 60)], [np.full(6, 2e-4)], 0.3)
     of_joints = (
         "armature",

@@ -114,9 +114,12 @@ def with_drives(file: Path, content: dict[str, Any]) -> str:
     root = read_xml(file, "mujoco")
     option = root.find("option")
     option = etree.SubElement(root, "option") if option is None else option
-    names = {"euler": "Euler", "implicitfast": "implicitfast", "rk4": "RK4"}
+    names = {"euler": "Euler", "explicit": "Euler", "implicitfast": "implicitfast", "rk4": "RK4"}
     option.set("timestep", f"{content['dt']:.9g}")
     option.set("integrator", names[content["integrator"]])
+    flag = option.find("flag")
+    flag = etree.SubElement(option, "flag") if flag is None else flag
+    flag.set("eulerdamp", "disable" if content["integrator"] == "explicit" else "enable")
     option.set("iterations", str(_ITERATIONS[0]))
     option.set("ls_iterations", str(_ITERATIONS[1]))
     _with_free_joints(root, content)

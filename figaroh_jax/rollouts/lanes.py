@@ -69,7 +69,8 @@ def known_to_it(loop: Loop, table: Table) -> bool:
     way = np.asarray(way)
     plain = all(j.kind in ("revolute", "prismatic") and not j.follows for j in robot.joints)
     plain &= len(robot.joints) == robot.nv <= _MOST and all(kind == "none" for kind in loop.drives.activation)
-    plain &= loop.integrator != "rk4" and not loop.limited and loop.carried is None and loop.linear is None
+    plain &= loop.integrator in ("euler", "implicitfast") and not loop.limited
+    plain &= loop.carried is None and loop.linear is None
     plain &= not loop.effects and loop.pairs is None
     single = bool(((way != 0).sum(1) <= 1).all() and ((way != 0).sum(0) <= 1).all())
     names = {*_JOINT[:13], *_DRIVE, "force_limit", "kp", "kd", "delay", "reading"}

@@ -50,7 +50,7 @@ __all__ = [
 ]
 
 Activation = Literal["none", "integrator", "filter", "filterexact"]
-Integrator = Literal["euler", "implicitfast", "rk4"]
+Integrator = Literal["euler", "implicitfast", "rk4", "explicit"]  # explicit: euler whose damping is, too
 _TINY = 1e-15  # MuJoCo's mjMINVAL
 STIFFEST = 0.9999  # impedance of a soft constraint, beyond which MuJoCo takes none
 _HARD = 1e-9  # softness that a hard friction keeps, as a share of the joint's mobility
@@ -376,6 +376,8 @@ def _smooth(loop: Loop, state: State, u: Array, weight: Array) -> _Smooth:
 
 def _resistance(loop: Loop, slope: Array) -> Array:
     """Minus the torque's derivative by v as the integrator takes it, (nv, nv, samples): joints' damping and drives."""
+    if loop.integrator == "explicit":
+        return jnp.zeros((loop.robot.nv, loop.robot.nv, slope.shape[1]))
     damping = jnp.eye(loop.robot.nv)[..., None] * jnp.asarray(loop.joints.damping)[:, None, None]
     way = jnp.asarray(loop.drives.transmission)
     pairs = way[:, :, None, None] * way[:, None, :, None]
@@ -388,6 +390,8 @@ def _resistance(loop: Loop, slope: Array) -> Array:
 
 def _resisted(loop: Loop, slope: Array, a: Array) -> Array:
     """`_resistance` times an acceleration, without the matrix: its derivatives are vectors then."""
+    if loop.integrator == "explicit":
+        return jnp.zeros_like(a)
     way = jnp.asarray(loop.drives.transmission)
     rate = times(way[..., None], a)
     own = jnp.asarray(loop.joints.damping)[:, None] * a

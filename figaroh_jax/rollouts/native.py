@@ -41,8 +41,8 @@ _PAIR = ("pair_inertia", "pair_damping", "pair_friction")
 _KINDS |= {name: 120 + k for k, name in enumerate(_PAIR)}
 _CARRIED_PAYLOAD = 202
 _GAIN, _BIAS, _COMMAND, _FORCE = 4, 7, 10, 12  # rows of a drive's numbers
-_LONGS = ("n", "nu", "links", "ny", "rates", "carried", "hard", "limited", "implicit", "windows", "rows", "lead",
-          "substeps", "block", "many", "columns", "pairs")  # fmt: skip
+_LONGS = ("n", "nu", "links", "ny", "rates", "carried", "hard", "limited", "implicit", "drag", "windows", "rows",
+          "lead", "substeps", "block", "many", "columns", "pairs")  # fmt: skip
 _ARRAYS = (
     "measured", "parent", "coordinate", "slides", "placement", "axis", "inertia", "gravity", "start", "joint",
     "drive", "way", "payload", "resting", "kind", "place", "column", "ten", "pair", "joined", "command", "reading",
@@ -130,6 +130,7 @@ class native:
             "links": 0 if loop.carried is None else len(loop.carried.payload),
             "rates": data.reading.shape[1] > len(loop.measured), "carried": loop.carried is not None,
             "hard": loop.law == "hard", "limited": loop.limited, "implicit": loop.integrator == "implicitfast",
+            "drag": loop.integrator != "explicit",
             "windows": start.shape[1], "rows": data.reading.shape[0] // data.block * data.block, "lead": data.lead,
             "substeps": data.substeps, "block": data.block, "many": len(arrays["kind"]), "columns": len(free),
             "pairs": arrays["pair"].shape[1],

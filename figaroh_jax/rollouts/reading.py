@@ -56,7 +56,7 @@ def load_loop(
         own, notes = (_usd_joints if form == "usd" else _urdf_joints)(robot, path), ()
         stated = _usd_drives(robot, path) if form == "usd" and not drives else drives or {}
         actuators, start = joint_drives(robot, stated, path), neutral(robot)
-        default = (0.002, "implicitfast", "hard", bool(np.isfinite(own.limit).any()))
+        default = (0.002, integrator or "implicitfast", "hard", bool(np.isfinite(own.limit).any()))
     else:
         file = find_in_packages(path, ())
         mj = compile_mjcf(file)
@@ -76,7 +76,7 @@ def load_loop(
         joints=own,
         start=start,
         dt=np.float64(dt or step),
-        integrator=integrator or scheme,  # pyright: ignore[reportArgumentType]
+        integrator=scheme,
         law=law or friction,  # pyright: ignore[reportArgumentType]
         limited=limited,
         measured=tuple(range(robot.nv)),
@@ -203,7 +203,8 @@ def _integrator(mj: Any, path: str | Path, wanted: Integrator | None) -> Integra
     kind = int(mj.opt.integrator)
     if kind not in _INTEGRATORS and wanted is None:
         raise InputError(f"{path}: option integrator is implicit; euler, implicitfast and RK4 are simulated")
-    return _INTEGRATORS.get(kind, "implicitfast")
+    scheme = wanted or _INTEGRATORS.get(kind, "implicitfast")
+    return "explicit" if scheme == "euler" and disabled(mj, "EULERDAMP") else scheme
 
 
 def _start(mj: Any, robot: RobotModel) -> np.ndarray:
@@ -278,8 +279,6 @@ def _left_out(mj: Any) -> list[str]:
         notes.append("what a late command does between the stages of RK4")
     if disabled(mj, "REFSAFE") and _stiff(mj):
         notes.append("constraints stiffer than two time steps (option flag refsafe is disabled)")
-    if scheme == "euler" and disabled(mj, "EULERDAMP") and mj.dof_damping.any():
-        notes.append("explicit damping (option flag eulerdamp is disabled)")
     if mj.opt.density or mj.opt.viscosity:
         notes.append("forces of the fluid (option density, viscosity)")
     if mj.body_gravcomp.any():

@@ -43,7 +43,9 @@ enum pair_number { TOGETHER, DRAG, RUB }; /* inertia, damping, dry friction of a
 enum unknown { OF_DRIVE = 100, LIMIT = 110, KP, KD, PAIR = 120, BODY = 200, PULL, CARRIED_BODY };
 
 typedef struct {
-  long n, nu, links, ny, rates, carried, hard, limited, implicit, windows, rows, lead, substeps, block, many, columns, pairs;
+  long n, nu, links, ny, rates, carried, hard, limited;
+  long implicit, drag; /* the step takes the drives' slopes, and the joints' damping, at its end */
+  long windows, rows, lead, substeps, block, many, columns, pairs;
   double dt;
   const long *measured;                      /* (ny) */
   const long *parent, *coordinate, *slides;  /* (n) of each tree joint */
@@ -645,8 +647,8 @@ INLINE void stepped(const Given *g, const Rigid *rigid, const int lane, Work *w,
   settled(g, w, n);
   int damped = 0;
   memset(w->D, 0, sizeof(double) * n * n);
-  for (int j = 0; j < n; j++) w->D[j * n + j] = JN(DAMPING), damped |= JN(DAMPING) != 0;
-  for (int k = 0; k < w->pairs; k++) {
+  for (int j = 0; g->drag && j < n; j++) w->D[j * n + j] = JN(DAMPING), damped |= JN(DAMPING) != 0;
+  for (int k = 0; g->drag && k < w->pairs; k++) {
     const int i = w->one[k], j = w->two[k];
     w->D[i * n + j] += w->way[k] * PN(DRAG), w->D[j * n + i] += w->way[k] * PN(DRAG), damped |= PN(DRAG) != 0;
   }
@@ -824,6 +826,7 @@ INLINE void linearised(const Given *g, const Rigid *rigid, const int lane, Work 
       const double f1 = by_q[k * n + c], f2 = second[k * n + c], f3 = by_v[k * n + c];
       for (int j = 0; j < n; j++) BY(c) -= W[k * n + j] * f1 + w->L[k * n + j] * f2, BY(n + c) -= W[k * n + j] * f3;
     }
+  const double drag = g->drag ? g->dt : 0;
   for (long p = 0; p < g->many; p++) {
     const long c = two + g->column[p], at = g->place[p], kind = g->kind[p];
     double one[MOST], more[MOST];
@@ -840,7 +843,7 @@ INLINE void linearised(const Given *g, const Rigid *rigid, const int lane, Work 
       const double s = w->way[k];
       if (kind == PAIR + TOGETHER) one[i] = s * w->a[j], one[j] = s * w->a[i], more[i] = s * x[j], more[j] = s * x[i];
       if (kind == PAIR + DRAG) {
-        one[i] = s * w->v[j], one[j] = s * w->v[i], more[i] = g->dt * s * w->moved[j], more[j] = g->dt * s * w->moved[i];
+        one[i] = s * w->v[j], one[j] = s * w->v[i], more[i] = drag * s * w->moved[j], more[j] = drag * s * w->moved[i];
       }
       if (kind == PAIR + RUB) one[i] = -w->held[k], one[j] = -s * w->held[k];
     }
@@ -898,7 +901,7 @@ INLINE void linearised(const Given *g, const Rigid *rigid, const int lane, Work 
       const int far = out > half ? 1 : out < -half ? -1 : 0;
       const double slip = w->level[j] > 0 || JN(FRICTION) + JN(PEAK) >= 0 ? w->slip[j] : 0;
       switch (kind) {
-        case DAMPING: t1 = v, t2 = g->dt * w->moved[j]; break;
+        case DAMPING: t1 = v, t2 = drag * w->moved[j]; break;
         case FRICTION: t1 = -slip; break;
         case PEAK: t1 = -slip * exp(-(v / JN(SPEED)) * (v / JN(SPEED))); break;
         case SPEED: t1 = -slip * JN(PEAK) * w->peak[j] * 2 * v * v / (JN(SPEED) * JN(SPEED) * JN(SPEED)); break;
