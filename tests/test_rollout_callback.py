@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from test_rollouts import HAND, explicit
 
-from figaroh_jax.formats.export import write_model
+from figaroh_jax.formats.export import load_model, write_model
 from figaroh_jax.jobs.export import export_loop
+from figaroh_jax.rollouts.callback import Rest
+from figaroh_jax.rollouts.causes import elastic_loop
 from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.simulation import rollout
-from figaroh_jax.rollouts.stored import add_loop
+from figaroh_jax.rollouts.stored import add_loop, read_loop, write_loop
 from figaroh_jax.rollouts.task import extended_of
 
 mujoco: Any = engine
@@ -81,8 +83,6 @@ def test_the_exported_files_start_and_move_as_the_original(root: str, integrator
     for _ in range(2):  # the second time from what the first one wrote
         export_loop(tmp_path / "model", "mujoco", tmp_path / "out")
         (tmp_path / "model" / "robot.xml").write_text((tmp_path / "out" / "robot.xml").read_text())
-    from figaroh_jax.rollouts.callback import Rest
-
     models = [mujoco.MjModel.from_xml_path(str(tmp_path / name)) for name in ("arm.xml", "out/robot.xml")]
     first, second = (mujoco.MjData(model) for model in models)
     rest = Rest(models[1], tmp_path / "out" / "loop.json")
@@ -98,13 +98,37 @@ def test_the_exported_files_start_and_move_as_the_original(root: str, integrator
     assert abs(first.joint("finger").qpos[0] - 0.3) > 0.1
 
 
+@pytest.mark.parametrize("play", [0.0, 0.03])
+def test_a_spring_between_motor_and_link_is_written_and_read_back(play: float, tmp_path: Path):
+    """The written MJCF has motor and link, the URDF the rigid robot; what comes back moves as MuJoCo C moves that."""
+    (tmp_path / "arm.xml").write_text(TWO)
+    plain = load_loop(tmp_path / "arm.xml")[0]
+    loop = elastic_loop(plain, 0, 90.0, 0.3)
+    loop = eqx.tree_at(lambda m: m.joints.play, loop, np.array([0.0, 0.0, play]))
+    write_loop(loop, tmp_path / "model")
+    robot, back = load_model(tmp_path / "model").robot, read_loop(tmp_path / "model")
+    assert (robot.joint_names, back.measured) == (("j1", "j2"), (0, 1))
+    assert back.robot.dof_names == ("j1", "j2", "j1_spring")
+    assert [one.link for one in robot.joints] == [one.link for one in plain.robot.joints]
+    np.testing.assert_allclose(robot.inertia, plain.robot.inertia, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(robot.placement, plain.robot.placement, rtol=0, atol=1e-15)
+    export_loop(tmp_path / "model", "mujoco", tmp_path / "out")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "robot.xml"))
+    data, rest = mujoco.MjData(model), Rest(model, tmp_path / "out" / "loop.json")
+    t = 0.002 * np.arange(800)[:, None]
+    u, seen = 0.4 * np.sin(t * [4.0, 7.0] + [0.0, 1.0]) * np.clip(t / 0.2, 0, 1) + [0.2, -0.3], []
+    for row in u:
+        seen.append([data.joint(name).qpos[0] for name in back.robot.dof_names])
+        rest.step(data, row)
+    assert np.ptp(seen, axis=0).min() > 0.02
+    np.testing.assert_allclose(rollout(back, u, np.zeros(3)).position, seen, rtol=0, atol=1e-9)
+
+
 def test_torques_at_a_joint_of_several_axes_are_refused(tmp_path: Path):
     (tmp_path / "arm.xml").write_text(HAND.replace("{root}", "").replace("{integrator}", "implicitfast"))
     loop = changed(load_loop(tmp_path / "arm.xml")[0], {"offset": [0.0, 0.0, 0.0, 0.1, 0.0]})
     write_model(extended_of(loop), tmp_path / "model")
     add_loop(tmp_path / "model", loop)
-    from figaroh_jax.rollouts.callback import Rest
-
     with pytest.raises(ValueError, match=r"tip\.wy: .* several axes"):
         Rest(mujoco.MjModel.from_xml_path(str(tmp_path / "model" / "robot.xml")), tmp_path / "model" / "loop.json")
 
@@ -115,7 +139,5 @@ def test_a_drive_with_a_state_is_refused(tmp_path: Path):
     write_model(extended_of(loop), tmp_path / "model")
     add_loop(tmp_path / "model", loop)
     export_loop(tmp_path / "model", "mujoco", tmp_path / "out")
-    from figaroh_jax.rollouts.callback import Rest
-
     with pytest.raises(ValueError, match="drive a has a state"):
         Rest(mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "robot.xml")), tmp_path / "out" / "loop.json")

@@ -16,6 +16,7 @@ import figaroh_jax as fj
 from figaroh_jax.cli import main
 from figaroh_jax.formats.export import write_model
 from figaroh_jax.recordings.reading import read_table
+from figaroh_jax.rollouts.causes import elastic_loop
 from figaroh_jax.rollouts.data import Run
 from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.stored import add_loop
@@ -143,6 +144,23 @@ def test_every_number_of_a_loop_is_read_back(text: str, tmp_path: Path):
                 np.testing.assert_array_equal(getattr(getattr(again, part), name), value, err_msg=name)
     assert (again.dt, again.integrator, again.law, again.limited) == (loop.dt, loop.integrator, loop.law, loop.limited)
     np.testing.assert_allclose(again.robot.inertia, loop.robot.inertia, rtol=0, atol=1e-12)
+
+
+def test_a_file_tells_the_motors_of_joints_with_a_spring_behind_them(tmp_path: Path):
+    """Where its positions start, and how far the motion is from them; the twist of the spring is no column of it."""
+    (tmp_path / "arm.xml").write_text(TWO)
+    loop = elastic_loop(fj.load_loop(tmp_path / "arm.xml")[0], 1, 60.0, 0.2)
+    fj.write_loop(loop, tmp_path / "model")
+    t = 0.002 * np.arange(300)
+    u = 0.3 * np.sin(t[:, None] * [5.0, 9.0])
+    truth = np.asarray(fj.rollout(loop, u, np.zeros(3)).position)
+    np.savez(tmp_path / "run.npz", t=t, u=u, q=truth[:, :2])
+    words = ["simulate", str(tmp_path / "model"), "--command", str(tmp_path / "run.npz"), "--columns", "u"]
+    assert main([*words, "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    with np.load(tmp_path / "out" / "simulation.npz") as found:
+        assert np.abs(found["position"] - truth).max() < 1e-3 < np.ptp(truth[:, 2])
+    answer = json.loads((tmp_path / "out" / "simulation.json").read_text())
+    assert answer["start"] == "the first rows of the file" and [*answer["error"]] == ["j1", "j2"]
 
 
 def test_torques_move_a_damped_pendulum_as_its_equation_says(tmp_path: Path):

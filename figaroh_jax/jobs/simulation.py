@@ -18,6 +18,7 @@ from ..recordings.draft_columns import Commands, read_commands
 from ..reporting.run_directory import check_directory, whole_directory
 from ..rigid.manifold import neutral
 from ..rigid.model import RobotModel
+from ..rollouts.causes import rigid
 from ..rollouts.data import Run, Stretch, noise_of, regular, windows
 from ..rollouts.loop import Loop
 from ..rollouts.simulation import rollout
@@ -78,7 +79,8 @@ def simulate(
     else:
         require_single_axes(robot, "a simulation of torques")
         drives, of, kinds = robot.dof_names, robot.dof_names, ("torque", "command")
-    given = read_commands(file, drives, of, robot, kinds=kinds, columns=columns, rate=rate)
+    told = rigid(moved).robot if isinstance(moved, Loop) else robot  # no column holds the twist of a spring
+    given = read_commands(file, drives, of, told, kinds=kinds, columns=columns, rate=rate)
     plan = _planned(file, given, float(moved.dt) if isinstance(moved, Loop) else _STEP)
     position, velocity, begun = _begun(moved, file, given, start)
     after = np.minimum(plan.row + 1, len(given.time) - 1)
@@ -152,7 +154,7 @@ def _begun(
         return q, v, "--start, at rest"
     if given.position is None:
         return q, v, "the model's zero, at rest"
-    if isinstance(moved, Loop) and given.joints == robot.dof_names:
+    if isinstance(moved, Loop) and given.joints == tuple(robot.dof_names[k] for k in moved.measured):
         refuse_other_units(moved, str(file), given.command, given.position)
         run = Run(file.name, given.time, given.command, given.position, given.velocity)
         cut = windows(moved, [run], [Stretch(0, 0, len(run.time))], [noise_of(run.position)], 0.3, smooth=True)

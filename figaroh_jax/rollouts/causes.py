@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -210,7 +211,7 @@ def elastic_loop(loop: Loop, coordinate: int, stiffness: float, damping: float) 
         lambda d: d.transmission, loop.drives, np.concatenate([moved, np.zeros((len(loop.drives.names), 1))], 1)
     )
     joints, start = _with_spring(loop.joints, stiffness, damping), np.append(np.asarray(loop.start), 0.0)
-    return replace(loop, robot=_with_motor(robot, i), drives=drives, joints=joints, start=start, linear=None)
+    return replace(loop, robot=with_motor(robot, i), drives=drives, joints=joints, start=start, linear=None)
 
 
 def elastic_table(loop: Loop, table: Table, coordinate: int) -> Table:
@@ -223,7 +224,42 @@ def elastic_table(loop: Loop, table: Table, coordinate: int) -> Table:
     return (*moved, *(Entry(name, (loop.robot.nv,)) for name in ("stiffness", "damping", "play")))
 
 
-def _with_motor(robot: RobotModel, i: int) -> RobotModel:
+def rigid(loop: Loop) -> Loop:
+    """The loop without the spring of `elastic_loop`: motor and link are one joint again."""
+    robot, i = loop.robot, motor_of(loop.robot)
+    if i is None:
+        return loop
+    first, spring = robot.joints[i : i + 2]
+    after = [joint._replace(parent=joint.parent - (joint.parent > i)) for joint in robot.joints[i + 2 :]]
+    left = {name: np.delete(np.asarray(getattr(robot, name)), i + 1, 0) for name in ("placement", "axis")}
+    left |= {name: np.delete(np.asarray(getattr(robot, name)), i + 1) for name in ("ratio", "offset")}
+    bare = RobotModel(
+        **left,
+        inertia=np.delete(np.asarray(robot.inertia), i, 0),
+        gravity=robot.gravity,
+        frame_placement=robot.frame_placement,
+        position_limit=np.asarray(robot.position_limit)[:-1],
+        velocity_limit=np.asarray(robot.velocity_limit)[:-1],
+        effort_limit=np.asarray(robot.effort_limit)[:-1],
+        joints=(*robot.joints[:i], first._replace(link=spring.link), *after),
+        frames=tuple(Frame(f.name, f.parent - (f.parent > i)) for f in robot.frames),
+        name=robot.name,
+    )
+    own = {name: np.asarray(getattr(loop.joints, name))[:-1] for name in loop.joints.__dataclass_fields__}
+    drives = eqx.tree_at(lambda d: d.transmission, loop.drives, np.asarray(loop.drives.transmission)[:, :-1])
+    return replace(loop, robot=bare, drives=drives, joints=type(loop.joints)(**own), start=np.asarray(loop.start)[:-1])
+
+
+def motor_of(robot: RobotModel) -> int | None:
+    """The joint of the motor that `elastic_loop` made, which has no body of its own, or None."""
+    for i, (motor, link) in enumerate(pairwise(robot.joints)):
+        pair = (f"{motor.name}_spring", i, robot.nv - 1, f"{link.link}_motor")
+        if (link.name, link.parent, link.coordinate, motor.link) == pair and not np.asarray(robot.inertia[i]).any():
+            return i
+    return None
+
+
+def with_motor(robot: RobotModel, i: int) -> RobotModel:
     """The robot with joint `i` twice: a motor without a body, behind it the link on a spring (the last coordinate)."""
     mine = robot.joints[i]
     motor = Joint(mine.name, mine.kind, mine.parent, mine.coordinate, f"{mine.link}_motor")

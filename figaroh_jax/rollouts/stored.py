@@ -12,9 +12,10 @@ import numpy as np
 from ..effects.base import Effect, place
 from ..effects.registry import find
 from ..errors import InputError
-from ..formats.export import load_model, write_model
+from ..formats.export import load_model, model_files, write_model
 from ..rigid.manifold import neutral
 from ..rigid.model import RobotModel
+from .causes import motor_of, rigid, with_motor
 from .export import described, described_text, with_drives
 from .loop import Drives, Joints, Loop, Pairs, acts_across
 from .reading import plain_joints
@@ -38,14 +39,19 @@ def write_loop(loop: Loop, directory: str | Path) -> None:
     ...     sorted(file.name for file in Path(folder).iterdir())
     ['effects.yaml', 'loop.json', 'robot.urdf', 'robot.xml']
     """
-    write_model(extended_of(loop), directory)
+    write_model(extended_of(rigid(loop)), directory)
     add_loop(Path(directory), loop)
 
 
 def add_loop(folder: Path, loop: Loop) -> None:
-    """`loop.json`, every number of the loop, and the drives in the `robot.xml` of a model that is written."""
+    """`loop.json`, every number of the loop, and the drives in the `robot.xml` of a model that is written.
+
+    A spring between motor and link stands in both of these; the robot of `effects.yaml` and `robot.urdf` is rigid.
+    """
     (folder / LOOP).write_text(described_text(loop), encoding="utf-8")
     mjcf = folder / "robot.xml"
+    if motor_of(loop.robot) is not None:
+        mjcf.write_text(model_files(extended_of(loop))[mjcf.name], encoding="utf-8")
     mjcf.write_text(with_drives(mjcf, described(loop)), encoding="utf-8")
 
 
@@ -79,11 +85,14 @@ def read_loop(folder: str | Path) -> Loop:
 
 
 def _loop(content: Mapping[str, Any], robot: RobotModel) -> Loop:
+    stiff = robot.nv
+    motors = [i for i, j in enumerate(robot.joints) if [*content["joints"]] == [*robot.dof_names, f"{j.name}_spring"]]
+    robot = with_motor(robot, motors[0]) if motors else robot
     names = robot.dof_names
     if [*content["joints"]] != [*names]:
         raise InputError(
-            f"its joints are {', '.join(content['joints'])}, those of effects.yaml {', '.join(names)}: a loop whose"
-            " motors have a position of their own (a joint elasticity) is not read back"
+            f"its joints are {', '.join(content['joints'])}, those of effects.yaml {', '.join(names)}; the files are"
+            " of one run"
         )
     return Loop(
         robot=robot,
@@ -94,7 +103,7 @@ def _loop(content: Mapping[str, Any], robot: RobotModel) -> Loop:
         integrator=content["integrator"],
         law=content["law"],
         limited=any(one["range"] is not None for one in content["limits"].values()),
-        measured=tuple(range(robot.nv)),
+        measured=tuple(range(stiff)),  # no encoder reads the twist of a spring
         pairs=_pairs(content.get("pairs", ()), names),
         effects=tuple(_effect(one, robot) for one in content.get("effects", ())),
     )

@@ -23,7 +23,7 @@ from ..results import BoundedEstimate, Cause, Diagnosis, Estimate, Experiment, G
 from .alone import inseparable, separable
 from .arm import search_arm
 from .bodies import body_notes, fitted_links, searched_with_bodies, told_alone
-from .causes import BASELINE
+from .causes import BASELINE, motor_of, rigid
 from .creep import REMARK, creep_notes, searched_with_both
 from .data import Run, Stretch, ahead_of_command, as_recorded, noise_of, regular, windows, without_gaps
 from .fit import Fit
@@ -209,7 +209,7 @@ def _cut(task: Task, loop: Loop, runs: Sequence[Run]) -> tuple[Stretch, ...]:
 
 
 def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes: tuple[str, ...]) -> RolloutDiagnosis:
-    loop, n = here.loop, here.loop.robot.nv
+    loop = here.loop
     first = Structure(here.loop, here.known.table, here.data)
     scale = here.noise[0]
     before, after = (_rms(s, f, scale) for s, f in ((first, found.first), (found.structure, found.last)))
@@ -223,7 +223,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
     rows = judged_rows(here)
     held = {run.name: (simulated(start, run, rows), simulated(final, run, rows)) for run in runs if run.holdout}
     gain = _gain(held, runs, found)
-    model = extended_of(final if n == final.robot.nv else start)
+    model = extended_of(rigid(final))
     traces = _traces(here, runs, first, found, last, held)
     refitted = _refitted(here, found if named else None, last)
     creeps = creep_notes(here, found) if named else {}
@@ -254,6 +254,7 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
             *(one_number_notes(found) if named else ()),
             *(_taken_gains(task, found) if named else ()),
             *implausible(loop.robot, model, task.robot.trust),
+            *_spring_note(final),
             *_refitted_note(here, runs, refitted, found.verdict),
         ),
         remark=REMARK if creeps else "",
@@ -416,6 +417,14 @@ def _slides(loop: Loop, at: Sequence[str]) -> bool:
     """Whether what stands at these places is about a joint that slides; without a joint, whether all do."""
     j = loop.robot.dof_names.index(at[0]) if at and at[0] in loop.robot.dof_names else -1
     return bool(not turns(loop)[j]) if j >= 0 else all_slide(loop)
+
+
+def _spring_note(loop: Loop) -> tuple[str, ...]:
+    """Which of the written files have the spring between motor and link."""
+    if (i := motor_of(loop.robot)) is None:
+        return ()
+    joint = loop.robot.joints[i].name
+    return (f"robot.xml has the spring between motor and link of {joint}; URDF has none, robot.urdf is rigid",)
 
 
 def _mixed(loop: Loop) -> bool:
