@@ -438,6 +438,8 @@ def for_simulator(content: dict[str, Any], name: str) -> dict[str, Any]:
     if name not in SIMULATORS:
         raise InputError(f"--for {name}: unknown{nearest(name, SIMULATORS)}; known: {', '.join(SIMULATORS)}")
     words, meaning = SIMULATORS[name]
+    if name == "mujoco" and content["integrator"] == "explicit":
+        meaning = meaning.replace("damping is implicit", "damping is explicit")
     values, unsaid = [], []
 
     def say(place: str, number: str, value: float | None, unit: str) -> None:

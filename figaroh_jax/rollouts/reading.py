@@ -42,8 +42,8 @@ def load_loop(
     An MJCF's joints, actuators, time step and integrator are taken as MuJoCo compiles them; `drives` replaces its
     actuators (of a stage: the drives of its joints), and states those of a URDF: `{joint: {kind: position, kp: 17.8,
     kd: 0.6, force: 3.35}}`. `law` is "soft" for an MJCF (its `frictionloss`) and "hard" otherwise, unless given.
-    Raises `InputError` for actuators that this
-    version does not simulate, with the actuator's name.
+    "euler" takes damping at the beginning of each step ("explicit") where the MJCF switches `eulerdamp` off. Raises
+    `InputError` for actuators that this version does not simulate, with the actuator's name.
 
     >>> import figaroh_jax as fj
     >>> loop, notes = fj.load_loop(fj.DEMO, {"elbow": {"kind": "position", "kp": 20.0, "kd": 0.5}}, joints=["elbow"])
