@@ -338,7 +338,7 @@ def checked(robot: Found, task: dict, moving: list[int], found: dict, run: Path)
             full[:, moving] = one[rows]
         truth = robot.torque(*whole, gravity)[:, moving]
         apart = np.abs(truth - torque[rows])
-        turning = np.abs(v[rows]) > 0.15 * np.abs(v).max(0)  # about rest dry friction is smoothed
+        turning = np.abs(v[rows]) > 0.4 * np.abs(v).max(0)  # about rest dry friction is smoothed
         if (apart * turning).max() > 1e-6 * (1 + np.abs(truth).max()):
             wrong.append(f"torque is off by {(apart * turning).max():.3g} of {np.abs(truth).max():.3g}")
         if found["met"]:

@@ -301,7 +301,7 @@ def _parser() -> argparse.ArgumentParser:
     for unused in ("--json", "--quiet", "--verbose", "--no-cache"):  # what is printed is JSON, and nothing else
         export.add_argument(unused, action="store_true", help=argparse.SUPPRESS)
     export.add_argument("--backend", help=argparse.SUPPRESS)
-    export.add_argument("task", type=Path, metavar="MODEL_DIR", help="`model` of a run directory")
+    export.add_argument("task", type=Path, metavar="MODEL_DIR", help="a run directory, or `model` in it")
     export.add_argument("--for", dest="simulator", required=True, metavar="NAME", help="mujoco, newton, isaaclab, ...")
     moved = commands.add_parser("simulate", help="move a run's model by the commands of a file")
     moved.add_argument("task", type=Path, metavar="MODEL_DIR", help="a run directory, or its `model`")

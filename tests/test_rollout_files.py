@@ -317,6 +317,54 @@ def test_a_rollout_in_another_unit_or_order_is_refused(spoil: Any, advice: str, 
     assert not (tmp_path / "run").exists()
 
 
+def test_commands_in_the_order_of_the_actuators_are_refused(tmp_path: Path, capsys):
+    """MuJoCo's `ctrl` as it is, of a hand whose first actuator is the last joint's: another joint's command each."""
+    (tmp_path / "arm.xml").write_text(GRIPPING)
+    t, u, q = moved(GRIPPING, 200)
+    np.savez(tmp_path / "run.npz", t=t, u=u, q=q)
+    entry = "{file: run.npz, time: t, command: u, position: q}"
+    (tmp_path / "task.yaml").write_text(f"robot: {{model: arm.xml}}\ndata: [{entry}]\n")
+    assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "run"), "--quiet"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "run.npz: the columns of `command` are read in the order of the joints (yaw, lift, left)" in said
+    assert "in the order of the model's actuators" in said and not (tmp_path / "run").exists()
+
+
+POLE = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/><worldbody><body>
+<joint name="cart" type="slide" axis="1 0 0" damping="2"/><inertial pos="0 0 0" mass="1" diaginertia=".1 .1 .1"/>
+<body><joint name="pole" axis="0 1 0" damping=".02"/><inertial pos="0 0 -.2" mass=".3" diaginertia=".004 .004 .001"/>
+</body></body></worldbody><actuator><position name="rail" joint="cart" kp="80" kv="4"/></actuator></mujoco>"""
+
+
+def test_a_joint_without_a_drive_needs_no_command(tmp_path: Path, capsys):
+    """A cart with a pole: one column, and the same numbers as with zeros for the pole; another count tells both."""
+    (tmp_path / "cart.xml").write_text(POLE)
+    model = mujoco.MjModel.from_xml_string(POLE.replace('damping=".02"', 'damping=".03"'))
+    data, rng, q = mujoco.MjData(model), np.random.default_rng(4), []
+    t = 0.01 * np.arange(500)
+    u = 0.3 * np.sin(2 * np.pi * t[:, None] * [0.5, 0.9, 1.3]).sum(1, keepdims=True)
+    for row in u:
+        q.append(data.qpos.copy())
+        data.ctrl[:] = row
+        mujoco.mj_step(model, data, 5)
+    read = np.array(q) + rng.normal(0, 2e-4, (500, 2))
+    found = []
+    for k, command in enumerate((u, np.hstack([u, 0 * u]))):
+        np.savez(tmp_path / "run.npz", t=t, u=command, q=read)
+        entry = "{file: run.npz, time: t, command: u, position: q}"
+        (tmp_path / "task.yaml").write_text(f"robot: {{model: cart.xml}}\ndata: [{entry}]\n")
+        assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / f"run{k}"), "--quiet"]) == 0
+        told = json.loads((tmp_path / f"run{k}" / "result.json").read_text())["base_parameters"]
+        found.append({one["expression"]: one["value"] for one in told})
+        (pole,) = (one for one in told if one["expression"] == "damping pole")
+        assert abs(pole["value"] - 0.03) < 4 * pole["std"] < 4e-3
+    assert found[0] == found[1]
+    np.savez(tmp_path / "run.npz", t=t, u=np.hstack([u, u, u]), q=read)
+    assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "no"), "--quiet"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "one column for each of cart, pole" in said and "or one column for each joint that is driven: cart" in said
+
+
 @pytest.mark.parametrize("late", [0, 3, 12])
 def test_only_a_position_that_moves_first_is_ahead_of_its_command(late: int):
     """Of MuJoCo's motion, read `late` rows after it was made; a command that is logged one row late is none."""

@@ -350,7 +350,7 @@ def test_rounding_is_no_change_of_a_link():
 
 
 def test_the_export_of_another_run_says_what_to_take(tmp_path: Path, capsys):
-    """A run of torques has no loop: its files are named; a run's folder is not its model."""
+    """A run of torques has no loop: its files are named; of a run's folder its model is taken."""
     model = tmp_path / "run" / "model"
     model.mkdir(parents=True)
     for name in ("robot.urdf", "effects.yaml"):
@@ -359,4 +359,4 @@ def test_the_export_of_another_run_says_what_to_take(tmp_path: Path, capsys):
     assert "the model of this run is in its robot.urdf, effects.yaml" in capsys.readouterr().err
     (model / "loop.json").write_text("{}")
     assert cli.main(["export", str(tmp_path / "run"), "--for", "mujoco"]) == 2
-    assert f"name {model}" in capsys.readouterr().err
+    assert f"{model / 'loop.json'}" in capsys.readouterr().err

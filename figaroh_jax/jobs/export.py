@@ -17,12 +17,13 @@ __all__ = ["LOOP", "export_loop"]
 
 
 def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
-    """The loop of a run's `model` directory in the words of a simulator, as JSON; with `out`, written there too.
+    """The loop of a run (its directory, or `model` in it) in the words of a simulator; with `out`, written there too.
 
     For MuJoCo `out` also gets `robot.xml`, with everything that MuJoCo has words for, and `callback.py` with
     `loop.json`, which do the rest step by step. Raises `InputError` for another directory, and for a simulator that
     is not known.
     """
+    model = model / "model" if (model / "model" / LOOP).is_file() else model
     try:
         content = json.loads((model / LOOP).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -41,8 +42,6 @@ def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
 
 def _advice(model: Path) -> str:
     """What to name instead of a directory that holds no loop."""
-    if (model / "model" / LOOP).is_file():
-        return f"name {model / 'model'}"
     if (model / "effects.yaml").is_file():
         files = ", ".join(name for name in ("robot.urdf", "robot.xml", "effects.yaml") if (model / name).is_file())
         return f"only rollouts (a command, no torque) have one; the model of this run is in its {files}"

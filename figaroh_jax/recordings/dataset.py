@@ -7,7 +7,7 @@ joint torque = torque @ motor torque; the offset is added to the joint position 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -77,14 +77,15 @@ class Recording:
 
 
 def read_recordings(
-    task: Task, model: RobotModel, *, floating: bool = False, rollouts: bool = False
+    task: Task, model: RobotModel, *, floating: bool = False, rollouts: bool = False, driven: Sequence[str] = ()
 ) -> tuple[Recording, ...]:
     """Read every recording of a task of torque level, or of `rollouts` (a command in place of torque), in its order.
 
-    With `floating` the root may be a free joint: the position then begins with its origin and quaternion (x y z,
-    x y z w), the torque with the measured wrench on it, force and torque about its origin in its own axes. Raises
-    `InputError` that names the file, the key, the row or the joint: missing or damaged files and columns, NaN, wrong
-    shapes, time that does not increase, names that the model does not know, a fit recording without torque.
+    With `floating` the root may be a free joint: the position then begins with its origin and quaternion (x y z, x
+    y z w), the torque with the measured wrench on it, force and torque about its origin in its own axes. Where
+    fewer joints are `driven` than move, commands may have a column for each of these alone. Raises `InputError`
+    that names the file, the key, the row or the joint: missing or damaged files and columns, NaN, wrong shapes,
+    time that does not increase, names that the model does not know, a fit recording without torque.
 
     >>> import figaroh_jax as fj
     >>> task = fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml"))
@@ -94,7 +95,7 @@ def read_recordings(
     """
     _check_names(task, model, floating, "commands" if rollouts else "joint torques")
     drive = Drive(task, model)
-    every = (_read(entry, f"data[{k}]", model, drive) for k, entry in enumerate(task.data))
+    every = (_read(entry, f"data[{k}]", model, drive, driven) for k, entry in enumerate(task.data))
     recordings = tuple(bridged(one, model) if rollouts else without_wild_rows(one, model) for one in every)
     if rollouts:
         lacking = next((r for r in recordings if r.command is None), None)
@@ -191,7 +192,7 @@ class Drive:
         return motor if self.torque is None else motor @ self.torque.T
 
 
-def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive) -> Recording:
+def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive, driven: Sequence[str] = ()) -> Recording:
     table = read_table(entry.file, f"{key}.file", Source(entry.format, entry.topic, entry.episode))
     units = entry.units
     angle = unit_factors(units.position, drive.position is not None, model)
@@ -203,7 +204,7 @@ def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive) -> R
         return None if source is None else _columns(table, source, columns, f"{key}.{name}", len(position))
 
     velocity, torque = optional("velocity", model.dof_names), optional("torque", model.dof_names)
-    command = optional("command", position_names(model))
+    command = _of_the_drives(optional, position_names(model), driven)
     if torque is not None and units.torque in _NO_TORQUE and drive.torque is None:
         raise InputError(
             f"{entry.file}: {key}.units.torque is {units.torque}: transmission.torque must say what one"
@@ -226,6 +227,26 @@ def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive) -> R
         role=entry.role,
         notes=_clock_beside(table, entry, len(position)),
     )
+
+
+def _of_the_drives(
+    optional: Callable[[str, Sequence[str]], np.ndarray | None], names: tuple[str, ...], driven: Sequence[str]
+) -> np.ndarray | None:
+    """Commands with a column for each joint; those that nothing drives may be left out, and are zero."""
+    if not driven or len(driven) >= len(names):
+        return optional("command", names)
+    try:
+        found = optional("command", driven)
+    except InputError:
+        try:
+            return optional("command", names)
+        except InputError as error:
+            raise InputError(f"{error}; or one column for each joint that is driven: {', '.join(driven)}") from None
+    if found is None:
+        return None
+    whole = np.zeros((len(found), len(names)))
+    whole[:, [names.index(name) for name in driven]] = found
+    return whole
 
 
 _NO_TORQUE = {"A": "ampere", "mA": "ampere", "%": "per cent"}

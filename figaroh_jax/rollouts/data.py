@@ -20,6 +20,7 @@ __all__ = [
     "Stretch",
     "ahead_of_command",
     "as_recorded",
+    "likeness",
     "noise_of",
     "regular",
     "told_by",
@@ -129,6 +130,13 @@ def ahead_of_command(command: Float[np.ndarray, " rows"], position: Float[np.nda
     ahead = most - int(like[:most].argmax())
     best, behind = like[:most].max(), like[most:].max()
     return ahead if ahead >= AHEAD_ROWS and best > AHEAD_LIKE and best > behind + AHEAD_MORE else 0
+
+
+def likeness(command: Float[np.ndarray, " rows"], position: Float[np.ndarray, " rows"], period: float) -> float:
+    """The largest correlation of a position with its command up to a second before; 0 where one of them stands."""
+    most = min(round(1.0 / period), len(command) // 2)
+    pairs = ((command[: len(command) - k], position[k:]) for k in range(0, most + 1, max(1, most // 25)))
+    return max(float(np.corrcoef(u, q)[0, 1]) if np.ptp(u) and np.ptp(q) else 0.0 for u, q in pairs)
 
 
 def noise_of(values: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from .arm import search_arm
 from .bodies import body_notes, fitted_links, searched_with_bodies, told_alone
 from .causes import BASELINE, motor_of, rigid
 from .creep import REMARK, creep_notes, searched_with_both
-from .data import Run, Stretch, ahead_of_command, as_recorded, noise_of, regular, windows, without_gaps
+from .data import Run, Stretch, ahead_of_command, as_recorded, likeness, noise_of, regular, windows, without_gaps
 from .fit import Fit
 from .loop import Loop, alike, brought_back, turns
 from .own import left_out
@@ -66,6 +66,7 @@ EFFECTS = {  # parameters of effects and the fields of `Joints` that hold them
 _SAME = {effect.name: called for called, effect in ROLLOUTS.items() if called != effect.name}
 _WINDOW, _OPEN = 15.0, 1.0  # s
 _FAR = 1e3  # rad or m: a simulation that gets there has diverged
+_FOLLOWS, _NEARER = 0.8, 0.25  # likeness of a joint to its command; how far it is from 1, of that of another's command
 _TURN = 12.0  # a command that many times beyond what the joint did is in other units
 
 
@@ -114,7 +115,9 @@ def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
             f"{task.file}: actuator: robot '{task.robot.model.name}' has no actuators; state each joint's drive, as in "
             "actuator: {joint_1: {kind: position, kp: 20.0, kd: 0.5}}"
         )
-    recordings = read_recordings(task, loop.robot, rollouts=True)
+    moved = np.abs(np.asarray(loop.drives.transmission)).argmax(1)
+    driven = [name for k, name in enumerate(loop.robot.dof_names) if k in moved]
+    recordings = read_recordings(task, loop.robot, rollouts=True, driven=driven)
     warnings = check_rollouts(task, loop.robot, recordings)
     runs, late = zip(*(_run(loop, r) for r in recordings), strict=True)
     periods = {regular(str(r.file), run.time) for r, run in zip(recordings, runs, strict=True)}
@@ -140,6 +143,7 @@ def _run(loop: Loop, recording: Recording) -> tuple[Run, str]:
     trusted = None if recording.trusted is None else np.logical_and.reduce(recording.trusted, axis=1)
     run = Run(recording.name, recording.time, command, recording.position, recording.velocity, held_out, trusted)
     run, late = without_gaps(run)
+    _check_columns(loop, recording, follows, columns)
     _check_order(loop, recording, run, follows, columns)
     return run, late
 
@@ -159,6 +163,24 @@ def refuse_other_units(loop: Loop, file: str, command: np.ndarray, position: np.
                 " Say `units: {position: deg}`, or convert it to the unit of the position"
             )
     return follows
+
+
+def _check_columns(loop: Loop, recording: Recording, follows: np.ndarray, columns: np.ndarray) -> None:
+    """Refuse commands in the order of the model's actuators where that is not the joints': MuJoCo's `ctrl` is so."""
+    swapped = np.flatnonzero(columns != np.arange(len(columns)))
+    if not len(swapped) or sorted(columns) != list(range(loop.robot.nv)) or not follows.all():
+        return
+    assert recording.command is not None
+    period = regular(str(recording.file), recording.time)
+    pairs = [(recording.command[:, k], recording.position[:, columns[k]]) for k in swapped]
+    others = [(recording.command[:, columns[k]], q) for k, (_, q) in zip(swapped, pairs, strict=True)]
+    right, wrong = ([likeness(u, q, period) for u, q in some] for some in (pairs, others))
+    if min(right) > _FOLLOWS and all(1 - x < _NEARER * (1 - y) for x, y in zip(right, wrong, strict=True)):
+        joints, drives = ", ".join(loop.robot.dof_names), ", ".join(loop.drives.names)
+        raise InputError(
+            f"{recording.file}: the columns of `command` are read in the order of the joints ({joints}), but these"
+            f" follow them in the order of the model's actuators ({drives}): put them in the order of the joints"
+        )
 
 
 def _check_order(loop: Loop, recording: Recording, run: Run, follows: np.ndarray, columns: np.ndarray) -> None:
