@@ -327,7 +327,34 @@ def test_commands_in_the_order_of_the_actuators_are_refused(tmp_path: Path, caps
     assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "run"), "--quiet"]) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "run.npz: the columns of `command` are read in the order of the joints (yaw, lift, left)" in said
-    assert "in the order of the model's actuators" in said and not (tmp_path / "run").exists()
+    assert (
+        "in the order of the model's actuators, which act at left, yaw, lift" in said
+        and not (tmp_path / "run").exists()
+    )
+
+
+def test_torques_in_the_order_of_the_motors_are_refused(tmp_path: Path, capsys):
+    """Motors that a controller outside drives, the elbow's first: a torque is told by the motion that it makes."""
+    text = ARM.format(finger="", first="").split("<actuator>")[0]
+    text += '<actuator><motor joint="lift" gear="-5"/><motor joint="yaw" gear="8"/></actuator></mujoco>'
+    (tmp_path / "arm.xml").write_text(text)
+    model = mujoco.MjModel.from_xml_string(text)
+    data, t, u, q = mujoco.MjData(model), 0.01 * np.arange(400), [], []
+    for now in t:
+        q.append(data.qpos.copy())
+        wanted = [0.8 * np.sin(3.1 * now), 0.6 * np.sin(2.3 * now) + 0.2 * np.sin(6.1 * now)]
+        torque = 20 * (wanted - data.qpos) - 2 * data.qvel
+        u.append([torque[1] / -5, torque[0] / 8])
+        data.ctrl[:] = u[-1]
+        mujoco.mj_step(model, data, 5)
+    entry = "{file: run.npz, time: t, command: u, position: q}"
+    (tmp_path / "task.yaml").write_text(f"robot: {{model: arm.xml}}\ndata: [{entry}]\n")
+    for columns, status in (([0, 1], 2), ([1, 0], 0)):
+        np.savez(tmp_path / "run.npz", t=t, u=np.array(u)[:, columns], q=np.array(q) + 1e-4 * np.cos(1e5 * t)[:, None])
+        words = ["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / f"run{status}"), "--quiet"]
+        assert main(words) == status
+    said = " ".join(capsys.readouterr().err.split())
+    assert "read in the order of the joints (yaw, lift)" in said and "which act at lift, yaw" in said
 
 
 POLE = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/><worldbody><body>

@@ -20,10 +20,10 @@ from ..rigid.manifold import neutral
 from ..rigid.model import RobotModel
 from ..rollouts.causes import rigid
 from ..rollouts.data import Run, Stretch, noise_of, regular, windows
+from ..rollouts.faults import refuse_other_units
 from ..rollouts.loop import Loop
 from ..rollouts.simulation import rollout
 from ..rollouts.stored import LOOP, read_loop
-from ..rollouts.task import refuse_other_units
 from .run import Done, Progress
 
 __all__ = ["SIMULATION", "simulate"]

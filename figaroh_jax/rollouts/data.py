@@ -132,10 +132,12 @@ def ahead_of_command(command: Float[np.ndarray, " rows"], position: Float[np.nda
     return ahead if ahead >= AHEAD_ROWS and best > AHEAD_LIKE and best > behind + AHEAD_MORE else 0
 
 
-def likeness(command: Float[np.ndarray, " rows"], position: Float[np.ndarray, " rows"], period: float) -> float:
-    """The largest correlation of a position with its command up to a second before; 0 where one of them stands."""
-    most = min(round(1.0 / period), len(command) // 2)
-    pairs = ((command[: len(command) - k], position[k:]) for k in range(0, most + 1, max(1, most // 25)))
+def likeness(
+    command: Float[np.ndarray, " rows"], follower: Float[np.ndarray, " rows"], latest: float, period: float
+) -> float:
+    """The largest correlation with a command up to `latest` s before; 0 where one of both stands."""
+    most = min(round(latest / period), len(command) // 2)
+    pairs = ((command[: len(command) - k], follower[k:]) for k in range(0, most + 1, max(1, most // 25)))
     return max(float(np.corrcoef(u, q)[0, 1]) if np.ptp(u) and np.ptp(q) else 0.0 for u, q in pairs)
 
 

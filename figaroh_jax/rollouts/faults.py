@@ -1,6 +1,7 @@
-"""Rows that no loop explains: a joint that is held from outside, a clock that jumps under regular stamps.
+"""What is wrong with recordings: other units or another order of commands, and rows that no loop explains.
 
-Both are looked for with a model that fits roughly, before causes are: a fit would bend to them.
+These are of a joint that is held from outside, or of a clock that jumps under regular stamps. Both are looked for with
+a model that fits roughly, before causes are: a fit would bend to them.
 """
 
 from __future__ import annotations
@@ -10,14 +11,16 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from scipy.optimize import nnls
 
 from ..compiled.batching import program
+from ..errors import InputError
 from ..rigid.dynamics import joint_torques
 from .alone import motion
-from .data import Run, regular
+from .data import Run, ahead_of_command, likeness, regular
 from .loop import Loop
 
-__all__ = ["Fault", "faults", "without"]
+__all__ = ["Fault", "faults", "refuse_other_order", "refuse_other_units", "without"]
 
 _SLOW, _LONG, _REACH = 0.02, 0.6, 2.0  # rad/s of a joint that stands, s, multiples of what friction holds
 _BLOCK, _JUMP, _ALIKE = 2.0, 2.0, 0.5  # s of one lag, periods of a jump, share by which joints may differ
@@ -26,6 +29,8 @@ _NEAR = 5  # blocks on either side that tell the size of a jump
 _WRONG, _HOLDS = 6.0, 1.2  # multiples of the usual error and of the friction, of a joint that stands
 _MOVING = 0.1  # rad/s
 _OFF, _SEVERAL = 3.0, 3  # multiples of the usual error, joints that are off by so much at once
+_FOLLOWS, _NEARER = 0.8, 0.25  # likeness of a joint to its command; how far it is from 1, of that of another's command
+_TURN = 12.0  # a command that many times beyond what the joint did is in other units
 _SAMPLES = 1024  # one program takes so many
 
 
@@ -56,6 +61,70 @@ class Fault(NamedTuple):
                 f"contact: {where}: {at} stand off the model's motion at once, the drives push by {self.size:.2g} N m"
             )
         return f"contact: {where}: {at} is held against {self.size:.2g} N m more than its friction can hold"
+
+
+def refuse_other_units(loop: Loop, file: str, command: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Which drives (nu,) follow their command; `InputError` where one goes far beyond what its joint (rows, nv) did."""
+    columns = np.abs(np.asarray(loop.drives.transmission)).argmax(1)
+    gain, bias = np.asarray(loop.drives.gain), np.asarray(loop.drives.bias)
+    follows = (gain[:, 0] != 0) & (bias[:, 1] != 0)
+    for k, column in enumerate(columns):
+        reach = max(np.abs(position[:, column]).max(), 0.3)
+        if follows[k] and np.abs(command[:, k]).max() > _TURN * reach:
+            row = int(np.abs(command[:, k]).argmax())
+            raise InputError(
+                f"{file}: the command of joint {loop.robot.dof_names[column]} reaches {command[row, k]:.4g}"
+                f" rad in row {row} (from 0), but the joint never leaves +-{reach:.3g} rad: is it in degrees or counts?"
+                " Say `units: {position: deg}`, or convert it to the unit of the position"
+            )
+    return follows
+
+
+def refuse_other_order(loop: Loop, file: str, run: Run, follows: np.ndarray) -> None:
+    """Refuse commands that are not those of the joints in their order, or that come after the motion.
+
+    MuJoCo's `ctrl` is in the order of the actuators. A position is like the command that it follows, a motor's command
+    like the torque that the motion takes: of its rigid body, and of friction and a rotor of any size.
+    """
+    columns, period = np.abs(np.asarray(loop.drives.transmission)).argmax(1), regular(file, run.time)
+    _refuse_order_of_drives(loop, file, run, follows)
+    pairs = zip(run.command[:, follows].T, columns[follows], strict=True)
+    moved = [(u, j) for u, j in pairs if np.ptp(u) and np.ptp(run.position[:, j])]
+    ahead = {loop.robot.dof_names[j]: ahead_of_command(u, run.position[:, j], period) for u, j in moved}
+    early = [name for name, rows in ahead.items() if rows]
+    if 2 * len(early) > len(moved):
+        raise InputError(
+            f"{file}: the position moves before its command at {', '.join(early)} (by {ahead[early[0]]} rows"
+            f" at {early[0]}): are `command` and `position` swapped, or is the command stamped late?"
+        )
+
+
+def _refuse_order_of_drives(loop: Loop, file: str, run: Run, follows: np.ndarray) -> None:
+    columns, period = np.abs(np.asarray(loop.drives.transmission)).argmax(1), regular(file, run.time)
+    swapped = np.flatnonzero(columns != np.arange(len(columns)))
+    motors = np.asarray(~np.asarray(loop.drives.bias).any(axis=1))
+    if not len(swapped) or sorted(columns) != list(range(loop.robot.nq)) or not (follows | motors).all():
+        return
+    given = run.command[:, np.argsort(columns)]  # as the file has them
+    way, motion_of = np.sign(np.asarray(loop.drives.transmission).sum(0)), motion(loop, run)
+    load = _carried(loop, run) if motors.any() else None
+
+    def like(u: np.ndarray, k: int) -> float:
+        j = columns[k]
+        if load is None or not motors[k]:
+            return likeness(u, run.position[:, j], 1.0, period)
+        _, v, a = (x[:, j] for x in motion_of)
+        taken = way[j] * np.stack([load[:, j], a, v, np.sign(v)], 1)  # and rotor, damping, friction of any size
+        centred = taken - taken.mean(0), u - u.mean()
+        return float(np.sqrt(max(0.0, 1 - nnls(*centred)[1] ** 2 / max(centred[1] @ centred[1], 1e-300))))
+
+    right, wrong = (np.array([like(some[:, k], int(k)) for k in swapped]) for some in (given, run.command))
+    if right.min() > _FOLLOWS and (1 - right < _NEARER * (1 - wrong)).all():
+        joints, at = (", ".join(loop.robot.dof_names[k] for k in some) for some in (range(len(columns)), columns))
+        raise InputError(
+            f"{file}: the columns of `command` are read in the order of the joints ({joints}), but these follow them in"
+            f" the order of the model's actuators, which act at {at}: put them in the order of the joints"
+        )
 
 
 def faults(loop: Loop, runs: Sequence[Run], simulated: Sequence[np.ndarray]) -> list[Fault]:

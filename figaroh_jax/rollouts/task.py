@@ -25,7 +25,8 @@ from .arm import search_arm
 from .bodies import body_notes, fitted_links, searched_with_bodies, told_alone
 from .causes import BASELINE, motor_of, rigid
 from .creep import REMARK, creep_notes, searched_with_both
-from .data import Run, Stretch, ahead_of_command, as_recorded, likeness, noise_of, regular, windows, without_gaps
+from .data import Run, Stretch, as_recorded, noise_of, regular, windows, without_gaps
+from .faults import refuse_other_order, refuse_other_units
 from .fit import Fit
 from .loop import Loop, alike, brought_back, turns
 from .own import left_out
@@ -54,7 +55,6 @@ __all__ = [
     "judged_rows",
     "one_number_notes",
     "read_rollouts",
-    "refuse_other_units",
     "simulated",
 ]
 
@@ -66,8 +66,6 @@ EFFECTS = {  # parameters of effects and the fields of `Joints` that hold them
 _SAME = {effect.name: called for called, effect in ROLLOUTS.items() if called != effect.name}
 _WINDOW, _OPEN = 15.0, 1.0  # s
 _FAR = 1e3  # rad or m: a simulation that gets there has diverged
-_FOLLOWS, _NEARER = 0.8, 0.25  # likeness of a joint to its command; how far it is from 1, of that of another's command
-_TURN = 12.0  # a command that many times beyond what the joint did is in other units
 
 
 class RolloutDiagnosis(NamedTuple):
@@ -143,58 +141,8 @@ def _run(loop: Loop, recording: Recording) -> tuple[Run, str]:
     trusted = None if recording.trusted is None else np.logical_and.reduce(recording.trusted, axis=1)
     run = Run(recording.name, recording.time, command, recording.position, recording.velocity, held_out, trusted)
     run, late = without_gaps(run)
-    _check_columns(loop, recording, follows, columns)
-    _check_order(loop, recording, run, follows, columns)
+    refuse_other_order(loop, str(recording.file), run, follows)
     return run, late
-
-
-def refuse_other_units(loop: Loop, file: str, command: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Which drives (nu,) follow their command; `InputError` where one goes far beyond what its joint (rows, nv) did."""
-    columns = np.abs(np.asarray(loop.drives.transmission)).argmax(1)
-    gain, bias = np.asarray(loop.drives.gain), np.asarray(loop.drives.bias)
-    follows = (gain[:, 0] != 0) & (bias[:, 1] != 0)
-    for k, column in enumerate(columns):
-        reach = max(np.abs(position[:, column]).max(), 0.3)
-        if follows[k] and np.abs(command[:, k]).max() > _TURN * reach:
-            row = int(np.abs(command[:, k]).argmax())
-            raise InputError(
-                f"{file}: the command of joint {loop.robot.dof_names[column]} reaches {command[row, k]:.4g}"
-                f" rad in row {row} (from 0), but the joint never leaves +-{reach:.3g} rad: is it in degrees or counts?"
-                " Say `units: {position: deg}`, or convert it to the unit of the position"
-            )
-    return follows
-
-
-def _check_columns(loop: Loop, recording: Recording, follows: np.ndarray, columns: np.ndarray) -> None:
-    """Refuse commands in the order of the model's actuators where that is not the joints': MuJoCo's `ctrl` is so."""
-    swapped = np.flatnonzero(columns != np.arange(len(columns)))
-    if not len(swapped) or sorted(columns) != list(range(loop.robot.nv)) or not follows.all():
-        return
-    assert recording.command is not None
-    period = regular(str(recording.file), recording.time)
-    pairs = [(recording.command[:, k], recording.position[:, columns[k]]) for k in swapped]
-    others = [(recording.command[:, columns[k]], q) for k, (_, q) in zip(swapped, pairs, strict=True)]
-    right, wrong = ([likeness(u, q, period) for u, q in some] for some in (pairs, others))
-    if min(right) > _FOLLOWS and all(1 - x < _NEARER * (1 - y) for x, y in zip(right, wrong, strict=True)):
-        joints, drives = ", ".join(loop.robot.dof_names), ", ".join(loop.drives.names)
-        raise InputError(
-            f"{recording.file}: the columns of `command` are read in the order of the joints ({joints}), but these"
-            f" follow them in the order of the model's actuators ({drives}): put them in the order of the joints"
-        )
-
-
-def _check_order(loop: Loop, recording: Recording, run: Run, follows: np.ndarray, columns: np.ndarray) -> None:
-    """Refuse a recording in which most joints that follow a command move before it does."""
-    period, position = regular(str(recording.file), run.time), run.position
-    pairs = zip(run.command[:, follows].T, columns[follows], strict=True)
-    moved = [(u, j) for u, j in pairs if np.ptp(u) and np.ptp(position[:, j])]
-    ahead = {loop.robot.dof_names[j]: ahead_of_command(u, position[:, j], period) for u, j in moved}
-    early = [name for name, rows in ahead.items() if rows]
-    if 2 * len(early) > len(moved):
-        raise InputError(
-            f"{recording.file}: the position moves before its command at {', '.join(early)} (by {ahead[early[0]]} rows"
-            f" at {early[0]}): are `command` and `position` swapped, or is the command stamped late?"
-        )
 
 
 def diagnosis_setting(task: Task, loop: Loop, runs: Sequence[Run]) -> Setting:
