@@ -83,8 +83,8 @@ def refuse_other_units(loop: Loop, file: str, command: np.ndarray, position: np.
 def refuse_other_order(loop: Loop, file: str, run: Run, follows: np.ndarray) -> None:
     """Refuse commands that are not those of the joints in their order, or that come after the motion.
 
-    MuJoCo's `ctrl` is in the order of the actuators. A position is like the command that it follows, a motor's command
-    like the torque that the motion takes: of its rigid body, and of friction and a rotor of any size.
+    MuJoCo's `ctrl` is in the order of the actuators. A position is like the command that it follows; the command of a
+    drive without a position is like the torque that the motion takes, with friction and a rotor of any size.
     """
     columns, period = np.abs(np.asarray(loop.drives.transmission)).argmax(1), regular(file, run.time)
     _refuse_order_of_drives(loop, file, run, follows)
@@ -102,19 +102,18 @@ def refuse_other_order(loop: Loop, file: str, run: Run, follows: np.ndarray) -> 
 def _refuse_order_of_drives(loop: Loop, file: str, run: Run, follows: np.ndarray) -> None:
     columns, period = np.abs(np.asarray(loop.drives.transmission)).argmax(1), regular(file, run.time)
     swapped = np.flatnonzero(columns != np.arange(len(columns)))
-    motors = np.asarray(~np.asarray(loop.drives.bias).any(axis=1))
-    if not len(swapped) or sorted(columns) != list(range(loop.robot.nq)) or not (follows | motors).all():
+    if not len(swapped) or sorted(columns) != list(range(loop.robot.nq)):
         return
     given = run.command[:, np.argsort(columns)]  # as the file has them
-    way, motion_of = np.sign(np.asarray(loop.drives.transmission).sum(0)), motion(loop, run)
-    load = _carried(loop, run) if motors.any() else None
+    way, moved = np.sign(np.asarray(loop.drives.transmission).sum(0)), motion(loop, run)
+    load = np.zeros_like(moved[0]) if follows.all() else _carried(loop, run)
 
     def like(u: np.ndarray, k: int) -> float:
         j = columns[k]
-        if load is None or not motors[k]:
+        if follows[k]:
             return likeness(u, run.position[:, j], 1.0, period)
-        _, v, a = (x[:, j] for x in motion_of)
-        taken = way[j] * np.stack([load[:, j], a, v, np.sign(v)], 1)  # and rotor, damping, friction of any size
+        _, v, a = (x[:, j] for x in moved)
+        taken = way[j] * np.stack([load[:, j], a, v, np.sign(v)], 1)
         centred = taken - taken.mean(0), u - u.mean()
         return float(np.sqrt(max(0.0, 1 - nnls(*centred)[1] ** 2 / max(centred[1] @ centred[1], 1e-300))))
 
