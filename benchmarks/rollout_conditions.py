@@ -1,6 +1,12 @@
 """Command and position as strangers record them: `diagnose` and `identify` of robots, drives and clocks that are drawn.
 
-    python benchmarks/rollout_conditions.py --seeds 0 60 [--effects nothing payload] [--most 3] [--jobs diagnose]
+    python benchmarks/rollout_conditions.py --seeds 0 60 [--effects nothing payload] [--most 3] [--commands diagnose]
+    python benchmarks/rollout_conditions.py --files FOLDER [FOLDER ...] [--part K N]
+
+With `--files` MuJoCo C moves the robots of the MJCF files there, whose joints are single axes, by sines at each
+actuator; damping, friction and rotors are off in every other one. Nothing is hidden. Commands are those of the drives,
+or of the joints where all are driven; every third time they stay in the order of the actuators, which is to be refused
+where it is another one.
 
 Drawn are: number of joints (`--most`), their axes and which of them slide, a branch, how the base is mounted (turned in
 the file, or gravity turned), inertias or geoms, joints' zero positions, order of the columns, drives (position servos
@@ -31,6 +37,7 @@ import mujoco
 import numpy as np
 import yaml
 
+import figaroh_jax as fj
 from figaroh_jax.cli import main as command_line
 
 MADE: Any = mujoco
@@ -81,7 +88,12 @@ def main() -> None:
     parser.add_argument("--integrators", nargs="+", default=["implicitfast", "implicitfast", "Euler", "Euler", "RK4"])
     parser.add_argument("--drives", nargs="+", choices=DRIVES, default=DRIVES)
     parser.add_argument("--commands", nargs="+", choices=["diagnose", "identify"], default=["diagnose", "identify"])
+    parser.add_argument("--files", nargs="+", type=Path, metavar="FOLDER", help="of MJCF files, in place of drawn ones")
+    parser.add_argument("--part", nargs=2, type=int, default=[0, 1], metavar=("K", "N"), help="every N-th file from K")
     args = parser.parse_args()
+    if args.files:
+        of_files(args.files, args.part, args.commands)
+        return
     count: collections.Counter[tuple[str, str]] = collections.Counter()
     odd, inside = [], list[tuple[int, int]]()
     for seed in range(*args.seeds):
@@ -373,6 +385,85 @@ def answered(case: Case, jobs: list[str]) -> tuple[list[str], list[str]]:
         (folder / "robot.xml").write_text(case.file)
         (folder / "task.yaml").write_text(yaml.safe_dump(case.task))
         return asked(folder, jobs, lambda job: (_diagnosed if job == "diagnose" else _identified)(case, folder / job))
+
+
+def of_files(folders: list[Path], part: list[int], jobs: list[str]) -> None:
+    """One line for each file of a robot."""
+    warnings.simplefilter("ignore", UserWarning)  # MuJoCo's, of words that it is going to forget
+    count: collections.Counter[str] = collections.Counter()
+    files = [file for folder in folders for file in sorted(folder.rglob("*.xml")) if _robot_of(file) is not None]
+    for k, file in [*enumerate(files)][part[0] :: part[1]]:
+        rng, model = np.random.default_rng([k, 93]), _robot_of(file)
+        runs = _by_sines(model, rng, off=k % 2 == 0)
+        if runs is None:
+            count["unstable"] += 1
+            continue
+        joints = [int(model.actuator_trnid[i, 0]) for i in range(model.nu)]
+        as_driven = k % 3 == 2 or model.nu < model.nv
+        columns = np.arange(model.nu) if as_driven else np.argsort(joints)
+        if model.nu < model.nv:
+            columns = np.argsort(joints)
+        due = as_driven and model.nu == model.nv and joints != sorted(joints)
+        with tempfile.TemporaryDirectory() as name:
+            folder, data = Path(name), []
+            for i, (t, u, q) in enumerate(runs):
+                noise = float(rng.choice([1e-4, 3e-4, 1e-3])) * rng.normal(size=q.shape)
+                np.savez(folder / f"run{i}.npz", t=t, u=u[:, columns], q=q + noise)
+                data.append({"file": f"run{i}.npz", "time": "t", "command": "u", "position": "q"})
+            task = {"robot": {"model": str(file.resolve())}, "data": data}
+            (folder / "task.yaml").write_text(yaml.safe_dump(task))
+            marks, lines = asked(folder, jobs, lambda job, here=folder: _told(here, job))
+        refused = "order of the model's actuators" in lines[0]
+        marks = ["refused" if refused == due else "odd"] if refused or due else marks
+        count[marks[0]] += 1
+        print(f"{file}: {marks}, {model.nu} drives of {model.nv} joints; {lines[0][:300]}", flush=True)
+    print(dict(count))
+
+
+def _told(folder: Path, job: str) -> tuple[str, str]:
+    return diagnosed(folder / job, lambda name: False) if job == "diagnose" else ("done", "")
+
+
+def _robot_of(file: Path) -> Any:
+    """A robot of named single axes that rollouts take whole, with at most one drive a joint; None for another file."""
+    if b"<mujoco" not in (text := file.read_bytes()) or b"<mujocoinclude" in text:
+        return None
+    try:
+        model = MADE.MjModel.from_xml_path(str(file))
+        loop, notes = fj.load_loop(file)
+    except (ValueError, fj.InputError):
+        return None
+    single = 1 <= model.nv <= 8 and (model.jnt_type >= 2).all() and all(model.joint(k).name for k in range(model.njnt))
+    whole = not [note for note in notes if not note.startswith("contacts")] and not model.neq
+    at = [int(x) for x in np.abs(np.asarray(loop.drives.transmission)).argmax(1)]
+    model.opt.disableflags |= int(MADE.mjtDisableBit.mjDSBL_CONTACT)
+    return model if single and whole and model.nu and len(set(at)) == len(at) else None
+
+
+def _by_sines(model: Any, rng: np.random.Generator, *, off: bool) -> list[tuple[np.ndarray, ...]] | None:
+    """Two recordings of 12 s at 100 Hz, with smaller commands where the robot does not stay where it is."""
+    if off:
+        for name, low, high in (("damping", 0.7, 1.5), ("frictionloss", 0.7, 1.5), ("armature", 0.8, 1.3)):
+            getattr(model, f"dof_{name}")[:] *= rng.uniform(low, high, model.nv)
+    every, held = max(1, round(0.01 / model.opt.timestep)), model.actuator_ctrllimited > 0
+    rows = round(12.0 / (every * model.opt.timestep))
+    t = every * model.opt.timestep * np.arange(rows)
+    low, high = (np.where(held, model.actuator_ctrlrange[:, k], (-0.5, 0.5)[k]) for k in (0, 1))
+    for share in (0.5, 0.2, 0.05):
+        runs = []
+        for _ in range(2):
+            rate, late = 2 * np.pi * rng.uniform(0.1, 0.8, (3, model.nu)), rng.uniform(0, 6, (3, model.nu))
+            size = rng.uniform(0.3, 1.0, (3, model.nu))
+            wave = (size / size.sum(0) * np.sin(rate * t[:, None, None] + late)).sum(1)
+            data, u, q = MADE.MjData(model), (low + high) / 2 + share * (high - low) / 2 * wave, []
+            for row in u:
+                q.append(data.qpos.copy())
+                data.ctrl[:] = row
+                MADE.mj_step(model, data, every)
+            runs.append((t, u, np.array(q)))
+        if all(np.isfinite(run[2]).all() and np.abs(run[2]).max() < 15 for run in runs):
+            return runs
+    return None
 
 
 def asked(folder: Path, jobs: list[str], judged: Callable[[str], tuple[str, str]]) -> tuple[list[str], list[str]]:
