@@ -31,7 +31,7 @@ from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.simulation import rollout
 from figaroh_jax.rollouts.stored import add_loop
-from figaroh_jax.rollouts.task import _gain as gain_of, extended_of
+from figaroh_jax.rollouts.task import _gain as gain_of, extended_of, read_rollouts
 
 mujoco: Any = engine
 
@@ -390,6 +390,19 @@ def test_a_joint_without_a_drive_needs_no_command(tmp_path: Path, capsys):
     assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "no"), "--quiet"]) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "one column for each of cart, pole" in said and "or one column for each joint that is driven: cart" in said
+
+
+def test_drives_of_one_joint_are_told_to_take_one_command(tmp_path: Path):
+    more = '<velocity name="brake" joint="cart" kv="3"/></actuator>'
+    (tmp_path / "cart.xml").write_text(POLE.replace("</actuator>", more))
+    t = 0.01 * np.arange(100)
+    np.savez(tmp_path / "run.npz", t=t, u=0.1 * np.sin(9 * t), q=np.stack([0.1 * np.sin(9 * t - 0.3), 0 * t], 1))
+    entry = "{file: run.npz, time: t, command: u, position: q}"
+    (tmp_path / "task.yaml").write_text(f"robot: {{model: cart.xml}}\ndata: [{entry}]\n")
+    assert (
+        "the drives rail and brake of cart take the same command"
+        in read_rollouts(fj.load_task(tmp_path / "task.yaml"))[2]
+    )
 
 
 @pytest.mark.parametrize("late", [0, 3, 12])

@@ -126,6 +126,9 @@ def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
     loop = eqx.tree_at(lambda m: m.dt, loop, np.float64(period / steps))
     notes = [f"{task.robot.model.name}: not simulated: {note}" for note in left_out]
     notes += [note for note in late if note]
+    for k in sorted({int(k) for k in moved if (moved == k).sum() > 1}):
+        both = " and ".join(name for name, at in zip(loop.drives.names, moved, strict=True) if at == k)
+        notes.append(f"the drives {both} of {loop.robot.dof_names[k]} take the same command")
     notes.append(f"simulated in steps of {1e3 * period / steps:.3g} ms, {steps} to a sample")
     return loop, runs, (*warnings, *notes)
 
