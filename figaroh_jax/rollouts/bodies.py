@@ -29,7 +29,7 @@ from .parameters import TEN, Entry, put, values
 from .screening import Standing, excess_of
 from .search import TOO_LITTLE, Model, Named, Search, t_of, t_of_recordings
 from .sensitivity import Windows
-from .setting import Setting, Structure, by_recording, free_entries, thinned
+from .setting import Setting, Structure, by_recording, excess, free_entries, thinned, whitened
 from .steady import most_unsteady
 from .thresholds import BODY, GAIN, GAIN_BESIDE_REST, MOST_OF_A_REST, STEADY_OF_A_LINK, T_BESIDE_REST, T_WITHOUT_REST
 
@@ -483,6 +483,12 @@ def _better(
     gain, t, enough = borne_out(part, before, after, MOST_OF_A_REST)
     if not enough or (fewer and after.excess.max() >= 1.0):
         return found
+    if (
+        after.excess.max()
+        < 1.0
+        <= excess(whitened(other.structure, other.last), np.asarray(other.structure.data.share))
+    ):
+        return found  # noise in the rows of a search, and not in all
     structure, last = _as_filed(whole, some, other)
     numbers = {number: name for name, number in ROLLOUTS[EFFECT].in_rollouts.numbers}
     sizes, named = [rms_of(part, x.held) for x in (before, after)], list[Named]()

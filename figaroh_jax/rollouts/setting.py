@@ -359,7 +359,9 @@ def bare(here: Setting, last: Fit) -> Fit | None:
     theta, own = np.asarray(values(here.loop, here.known.table)).copy(), list(here.baseline)
     theta[own] = last.theta[own]
     structure = Structure(here.loop, here.known.table, here.data)
-    one = fit(*structure, theta[None], [here.baseline], width=here.width, lanes=1)[0]
+    same = last.start.shape == np.shape(here.data.start)  # a spring has states of its own
+    known = last.start[None] if same else None
+    one = fit(*structure, theta[None], [here.baseline], known, width=here.width, lanes=1)[0]
     return one if np.isfinite(one.cost) and one.squares < last.squares + SURE_OF_NOISE else None
 
 
