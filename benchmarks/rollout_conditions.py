@@ -414,7 +414,7 @@ def of_files(folders: list[Path], part: list[int], jobs: list[str]) -> None:
             (folder / "task.yaml").write_text(yaml.safe_dump(task))
             marks, lines = asked(folder, jobs, lambda job, here=folder: _told(here, job))
         refused = "order of the model's actuators" in lines[0]
-        marks = ["refused" if refused == due else "odd"] if refused or due else marks
+        marks = ["refused" if due else "odd"] if refused else ["not told"] if due else marks
         count[marks[0]] += 1
         print(f"{file}: {marks}, {model.nu} drives of {model.nv} joints; {lines[0][:300]}", flush=True)
     print(dict(count))

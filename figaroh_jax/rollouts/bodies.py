@@ -483,12 +483,9 @@ def _better(
     gain, t, enough = borne_out(part, before, after, MOST_OF_A_REST)
     if not enough or (fewer and after.excess.max() >= 1.0):
         return found
-    if (
-        after.excess.max()
-        < 1.0
-        <= excess(whitened(other.structure, other.last), np.asarray(other.structure.data.share))
-    ):
-        return found  # noise in the rows of a search, and not in all
+    left = excess(whitened(other.structure, other.last), np.asarray(other.structure.data.share))
+    if after.excess.max() < 1.0 <= left:
+        return found  # noise in the rows that are searched, and not in all
     structure, last = _as_filed(whole, some, other)
     numbers = {number: name for name, number in ROLLOUTS[EFFECT].in_rollouts.numbers}
     sizes, named = [rms_of(part, x.held) for x in (before, after)], list[Named]()
