@@ -390,6 +390,11 @@ def test_a_joint_without_a_drive_needs_no_command(tmp_path: Path, capsys):
     assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "no"), "--quiet"]) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "one column for each of cart, pole" in said and "or one column for each joint that is driven: cart" in said
+    u[7] = np.nan  # what is wrong with the one column is said of it
+    np.savez(tmp_path / "run.npz", t=t, u=u, q=read)
+    assert main(["identify", str(tmp_path / "task.yaml"), "--out", str(tmp_path / "no"), "--quiet"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "row 7" in said and "shape" not in said and not (tmp_path / "no").exists()
 
 
 def test_drives_of_one_joint_are_told_to_take_one_command(tmp_path: Path):

@@ -204,7 +204,7 @@ def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive, driv
         return None if source is None else _columns(table, source, columns, f"{key}.{name}", len(position))
 
     velocity, torque = optional("velocity", model.dof_names), optional("torque", model.dof_names)
-    command = _of_the_drives(optional, position_names(model), driven)
+    command = _of_the_drives(table, entry.command, optional, position_names(model), driven)
     if torque is not None and units.torque in _NO_TORQUE and drive.torque is None:
         raise InputError(
             f"{entry.file}: {key}.units.torque is {units.torque}: transmission.torque must say what one"
@@ -230,23 +230,29 @@ def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive, driv
 
 
 def _of_the_drives(
-    optional: Callable[[str, Sequence[str]], np.ndarray | None], names: tuple[str, ...], driven: Sequence[str]
+    table: Table,
+    source: str | Sequence[str] | None,
+    optional: Callable[[str, Sequence[str]], np.ndarray | None],
+    names: tuple[str, ...],
+    driven: Sequence[str],
 ) -> np.ndarray | None:
     """Commands with a column for each joint; those that nothing drives may be left out, and are zero."""
-    if not driven or len(driven) >= len(names):
+    if source is None or not driven or len(driven) >= len(names):
         return optional("command", names)
+    if isinstance(source, str) and source in table.names:
+        values = table.read(source)
+        wide = 1 if values.ndim < 2 else values.shape[1]
+    else:
+        wide = sum(name.startswith(source) for name in table.names) if isinstance(source, str) else len(source)
+    if wide == len(driven):
+        whole = np.zeros((len(found := np.asarray(optional("command", driven))), len(names)))
+        whole[:, [names.index(name) for name in driven]] = found
+        return whole
     try:
-        found = optional("command", driven)
-    except InputError:
-        try:
-            return optional("command", names)
-        except InputError as error:
-            raise InputError(f"{error}; or one column for each joint that is driven: {', '.join(driven)}") from None
-    if found is None:
-        return None
-    whole = np.zeros((len(found), len(names)))
-    whole[:, [names.index(name) for name in driven]] = found
-    return whole
+        return optional("command", names)
+    except InputError as error:
+        other = f"; or one column for each joint that is driven: {', '.join(driven)}" * (wide not in (0, len(names)))
+        raise InputError(f"{error}{other}") from None
 
 
 _NO_TORQUE = {"A": "ampere", "mA": "ampere", "%": "per cent"}
