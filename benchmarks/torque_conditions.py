@@ -16,10 +16,12 @@ from __future__ import annotations
 
 import argparse
 import collections
+import contextlib
 import json
 import re
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -580,6 +582,13 @@ def _measured(
 
 def answered(case: Case, jobs: list[str], keep: Path | None = None) -> tuple[list[str], list[str]]:
     """How each command did, in a word and in a line."""
+    with written(case, keep) as folder:
+        return asked(folder, jobs, lambda job: (_diagnosed if job == "diagnose" else _identified)(case, folder / job))
+
+
+@contextlib.contextmanager
+def written(case: Case, keep: Path | None) -> Iterator[Path]:
+    """The folder with a case's files, its recordings and its `task.yaml`."""
     with tempfile.TemporaryDirectory() as name:
         folder = keep or Path(name)
         folder.mkdir(parents=True, exist_ok=True)
@@ -604,7 +613,7 @@ def answered(case: Case, jobs: list[str], keep: Path | None = None) -> tuple[lis
         for file, text in case.files.items():
             (folder / file).write_text(text)
         (folder / "task.yaml").write_text(yaml.safe_dump(case.task))
-        return asked(folder, jobs, lambda job: (_diagnosed if job == "diagnose" else _identified)(case, folder / job))
+        yield folder
 
 
 def _diagnosed(case: Case, out: Path) -> tuple[str, str]:

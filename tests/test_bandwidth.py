@@ -54,6 +54,28 @@ def test_a_cutoff_far_above_the_motion_of_a_coarse_encoder_is_not_where_it_is_sm
     assert np.std(off[500:-500]) < 0.1, seed  # rad/s^2 of some 40; 2 at 31 Hz, an eighth of the cutoff
 
 
+@pytest.mark.parametrize(("rate", "counts"), [(100.0, 2**18), (200.0, 2**14), (500.0, 2**14)])
+def test_a_start_from_rest_is_not_lost_in_the_noise_of_all_the_rest(rate: float, counts: int) -> None:
+    """Waves that begin within a second: a corner of the acceleration, of which the spectrum of 15 s shows nothing."""
+    seed = secrets.randbits(32)
+    rng, time, times = np.random.default_rng(seed), np.arange(0, 15, 1 / rate), []
+    grow, step, cutoff = np.clip(time, 0, 1), 2 * np.pi / counts, min(20.0, 0.2 * rate)
+    begun = 10 * grow**3 - 15 * grow**4 + 6 * grow**5
+    slope = 30 * grow**2 - 60 * grow**3 + 30 * grow**4
+    bend = 60 * grow - 180 * grow**2 + 120 * grow**3
+    for _ in range(7):
+        wave, size = 2 * np.pi * rng.uniform(0.06, 0.9, 3), np.array([0.6, 0.3, 0.12])
+        angle = wave * time[:, None] + rng.uniform(0, 6, 3)
+        s, c = np.sin(angle), np.cos(angle)
+        true = bend * (s @ size) + 2 * slope * (c @ (size * wave)) - begun * (s @ (size * wave**2))
+        read, off = np.round(begun * (s @ size) / step) * step, []
+        for band in [motion_band(read, 1 / rate, cutoff, step, rate), *(cutoff * 2.0 ** (-np.arange(13) / 2))]:
+            found = np.gradient(np.gradient(smoothed(read, 1 / rate, band), 1 / rate), 1 / rate)
+            off.append(np.std((found - true)[3:-3]))
+        times.append(off[0] / min(off))
+    assert np.median(times) < 1.8, (seed, times)  # 3 to 15 where the spectrum of the whole alone is asked
+
+
 def test_a_motion_that_is_faster_than_the_noise_keeps_its_cutoff() -> None:
     seed = secrets.randbits(32)
     position, _ = swung(14.0, seed)

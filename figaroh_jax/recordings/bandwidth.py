@@ -31,7 +31,9 @@ FEWEST = 200  # samples from which a spectrum tells motion and noise apart
 FELT = 0.1  # of the noise's power: steps of less are lost in it
 FEW_VALUES = 20  # of a position: fewer are steps
 LINE = 3  # bins to either side to which the window spreads a line
+AT_ONCE = 64  # stretches, for the memory that they take
 READINGS = 4  # of a motion by an encoder, each with its steps at another place
+STRETCH = 1.0  # s in which a motion that is short may show, and no less than 20 periods of the cutoff
 
 
 def note_on(band: Band) -> tuple[str, ...]:
@@ -50,8 +52,10 @@ def motion_band(
     """Frequency (Hz, at most `cutoff`) up to which a position (rad or m, every `dt` s) holds more motion than noise.
 
     The noise is taken as white in the position, at its level between one and two and a half times the cutoff, but
-    nowhere as less than what the `step` of an encoder makes of such a motion (`_stepping`). `rate` (Hz) is that of the
-    recording, where it is not 1/dt: above 0.4 of it the samples hold nothing.
+    nowhere as less than what the `step` of an encoder makes of such a motion (`_stepping`). Motion is asked of the
+    recording as a whole and of short stretches of it: a start from rest, or a corner of the acceleration, is lost in
+    the noise of all the rest. `rate` (Hz) is that of the recording, where it is not 1/dt: above 0.4 of it the samples
+    hold nothing.
     """
     if len(position) < FEWEST:
         return cutoff
@@ -62,9 +66,12 @@ def motion_band(
         return cutoff
     low = (frequency > 0) & (frequency < 2 * cutoff)
     noise = np.full(int(low.sum()), float(power[high].mean()))
+    steps = None
     if step**2 / 12 > FELT * noise[0] * (rate or 1 / dt) * dt:
-        noise = np.maximum(noise, _stepping(position, dt, cutoff, step, rate or 1 / dt, frequency, power)[low])
+        steps = _stepping(position, dt, cutoff, step, rate or 1 / dt, frequency, power)
+        noise = np.maximum(noise, _line_by_line(steps, 1 / (rate or 1 / dt), dt, frequency)[low])
     weight, motion = frequency[low] ** 4, np.where(power[low] > CHANCE * noise, power[low] - noise, 0.0)
+    motion = np.maximum(motion, _in_stretches(position, dt, cutoff, frequency[low], noise, steps, rate or 1 / dt))
     gain = 1 / (1 + (frequency[low] / (cutoff * STEPS[:, None])) ** (2 * ORDER))
     error = ((1 - gain) ** 2 * motion + gain**2 * noise) @ weight
     best = int(np.argmin(error))
@@ -86,29 +93,76 @@ def encoder_step(position: Float[np.ndarray, " samples"]) -> float:
 
 def _stepping(
     position: np.ndarray, dt: float, cutoff: float, step: float, rate: float, frequency: np.ndarray, power: np.ndarray
-) -> Float[np.ndarray, " freqs"]:
-    """Power at each frequency of the error that an encoder's `step` makes of the position's own motion.
+) -> Float[np.ndarray, "readings read"]:
+    """Errors that an encoder's `step` makes of the position's own motion, read at `rate` (Hz).
 
     Slow motion makes a sawtooth of |v| / step Hz, whose lines stand far below the encoder's Nyquist frequency and far
     above its mean error. So the motion, smoothed until no more than twice the variance of the steps (step^2 / 12) is
-    taken off, is read once more, at several places of its steps. The power of the errors is averaged over them and over
-    a fifth of the frequency, and is nowhere less than that of a line close by.
+    taken off, is read once more, at several places of its steps.
     """
     above = 2 * np.cumsum(power[::-1])[::-1] / len(position)
     first = int(np.argmax(above <= 2 * step**2 / 12))
     smooth = smoothed(position, dt, min(max(frequency[first], cutoff * STEPS[-1]), cutoff))
     time = np.arange(len(smooth)) * dt
     read = np.interp(np.arange(0, time[-1], 1 / rate), time, smooth)
-    window = np.kaiser(len(read), WINDOW)
     offset = np.arange(READINGS)[:, None] / READINGS
-    error = step * (np.round(read / step + offset) - offset) - read
-    each = (np.abs(np.fft.rfft((error - error.mean(1, keepdims=True)) * window)) ** 2).mean(0) / (window**2).sum()
-    seen = np.interp(frequency, np.fft.rfftfreq(len(read), 1 / rate), each / (rate * dt), right=0.0)
-    whole, place = np.append(0.0, np.cumsum(seen)), np.arange(len(seen))
+    return step * (np.round(read / step + offset) - offset) - read
+
+
+def _line_by_line(
+    error: Float[np.ndarray, "readings *stretches read"], every: float, dt: float, frequency: np.ndarray
+) -> Float[np.ndarray, "*stretches freqs"]:
+    """Power of readings' errors (samples `every` s), at frequencies of a position's spectrum (samples `dt` s apart).
+
+    It is averaged over the readings and over a fifth of the frequency, and is nowhere less than that of a line close
+    by.
+    """
+    window = np.kaiser(error.shape[-1], WINDOW)
+    each = np.abs(np.fft.rfft((error - error.mean(-1, keepdims=True)) * window)) ** 2
+    each = each.mean(0) / (window**2).sum() * (every / dt)
+    place = frequency * error.shape[-1] * every
+    low = np.minimum(place.astype(int), each.shape[-1] - 2)
+    seen = each[..., low] + (place - low) * (each[..., low + 1] - each[..., low])
+    seen = np.where(place <= each.shape[-1] - 1, seen, 0.0)
+    whole, place = np.cumsum(seen, axis=-1), np.arange(seen.shape[-1])
+    whole = np.concatenate([np.zeros_like(whole[..., :1]), whole], axis=-1)
     reach = np.maximum(place // 10, LINE)
-    begin, end = np.maximum(place - reach, 0), np.minimum(place + reach + 1, len(seen))
-    line = np.lib.stride_tricks.sliding_window_view(np.pad(seen, LINE), 2 * LINE + 1).max(1)
-    return np.maximum((whole[end] - whole[begin]) / (end - begin), line)
+    begin, end = np.maximum(place - reach, 0), np.minimum(place + reach + 1, len(place))
+    padded = np.pad(seen, [(0, 0)] * (seen.ndim - 1) + [(LINE, LINE)])
+    line = np.lib.stride_tricks.sliding_window_view(padded, 2 * LINE + 1, axis=-1).max(-1)
+    return np.maximum((whole[..., end] - whole[..., begin]) / (end - begin), line)
+
+
+def _in_stretches(
+    position: np.ndarray,
+    dt: float,
+    cutoff: float,
+    frequency: np.ndarray,
+    noise: np.ndarray,
+    steps: np.ndarray | None,
+    rate: float,
+) -> Float[np.ndarray, " freqs"]:
+    """Power of the motion that shows above the `noise` in stretches of `STRETCH`, each begun a quarter further on.
+
+    `steps` are errors of readings at `rate` (Hz), of which each stretch has its own.
+    """
+    second, samples = np.diff(position, 2), round(max(STRETCH, 20.0 / cutoff) / dt)
+    if len(second) <= samples:
+        return np.zeros_like(noise)
+    begins = np.append(np.arange(0, len(second) - samples, max(samples // 4, 1)), len(second) - samples)
+    window, own = np.kaiser(samples, WINDOW), np.fft.rfftfreq(samples, dt)
+    share = np.append(np.inf, (2 * np.sin(np.pi * own[1:] * dt)) ** 4) * (window**2).sum()
+    white, above = np.interp(own, frequency, noise), np.zeros_like(own)
+    parts = np.lib.stride_tricks.sliding_window_view(second, samples)
+    for some in np.array_split(begins, math.ceil(len(begins) / AT_ONCE)):
+        power, usual = np.abs(np.fft.rfft(parts[some] * window)) ** 2 / share, white
+        if steps is not None:
+            read = round(samples * dt * rate)
+            at = np.minimum(np.round(some * dt * rate).astype(int), steps.shape[1] - read)
+            local = np.lib.stride_tricks.sliding_window_view(steps, read, axis=1)[:, at]
+            usual = np.maximum(white, _line_by_line(local, 1 / rate, dt, own))
+        above += np.where(power > CHANCE * usual, power - usual, 0.0).sum(0) / len(begins)
+    return np.interp(frequency, own, above)
 
 
 def smoothed(position: Float[np.ndarray, " samples"], dt: float, band: float) -> Float[np.ndarray, " samples"]:
