@@ -43,7 +43,7 @@ class Robot(NamedTuple):
     gravity: np.ndarray  # m/s^2
     parents: list[int]  # joint that carries a joint, or -1
     links: dict[str, int]  # joint that moves a link
-    real: Callable[..., tuple[Torque, Any]]  # (gravity, errors of links, load) -> torque, model of MuJoCo C
+    real: Callable[..., tuple[Torque, Any]]  # (gravity, errors of links, load) -> rigid torque, model of MuJoCo C
 
 
 def main() -> None:
@@ -116,7 +116,7 @@ def _of_urdf(file: Path) -> Robot | None:
                     full[joint.idx_q : joint.idx_q + joint.nq] = turned
                 speed[at], rise[at] = v[k], a[k]
                 out[k] = pin.rnea(own, data, full, speed, rise)[at]
-            return out + own.damping[at] * v  # its dry friction is a part of what is drawn
+            return out
 
         return torque, None
 
@@ -152,7 +152,7 @@ def _of_mjcf(file: Path) -> Robot | None:
 
     def real(pull: np.ndarray, errors: np.ndarray, load: tuple[int, float, np.ndarray] | None) -> tuple[Torque, Any]:
         own = _loaded(file)
-        own.opt.gravity[:] = pull
+        own.opt.gravity[:], own.dof_damping[:], own.dof_frictionloss[:] = pull, 0.0, 0.0
         for k, (mass, *move, turn) in enumerate(errors):
             body = own.jnt_bodyid[k]
             own.body_mass[body] *= 1 + mass
@@ -249,7 +249,7 @@ def drawn(
     load = weight + inertia * travel * 4.0  # torque that is typical of the joint
     if (load[moving] < 1e-3 * load.max()).any() or load.max() < 1e-3:
         return None
-    if (travel[moving] < 0.01).any():
+    if (travel[moving] < 0.01).any() or (effect == "gravity_tilt" and not pull.any()):
         return None
     j = int(rng.choice(moving))
     size = float(rng.choice([0.1, 0.2, 0.4]))

@@ -32,6 +32,7 @@ __all__ = ["Reader", "only_read"]
 
 READINGS = 3  # of all recordings, each with its encoders' steps and noise drawn anew
 AS_MUCH = 2.0  # times the squares that readings leave: what chance makes of a few reversals
+EVERYWHERE = 1.25  # times, where readings err in nearly all rows, so that none says how the model does without
 QUIET = 0.5  # of the noise: rows whose readings err by less say how the model does without that
 
 
@@ -99,9 +100,9 @@ def only_read(
     rounding: Float[np.ndarray, " nv"],
 ) -> bool:
     """Whether what the state leaves beyond the `noise` (N m or N) is no more than readings of a right model leave, and
-    no larger than tolerable in the rows where readings leave little; or is what they leave, row by row, but for what is
-    tolerable; or no more than the `rounding` of the torque (RMS, N m or N), which repeats with a motion and is asked
-    alone where there are no `errors`.
+    no larger than tolerable in the rows where readings leave little, if there are such rows; or is what they leave, row
+    by row, but for what is tolerable; or no more than the `rounding` of the torque (RMS, N m or N), which repeats with
+    a motion and is asked alone where there are no `errors`.
 
     `relative` is what it leaves of all rows over each joint's torque: a joint below the tolerance is not looked at. Of
     a joint that stands still at times the rows at rest only have to stay within what its dry friction can hold.
@@ -118,8 +119,9 @@ def only_read(
     quiet = used & (spread < (QUIET * noise) ** 2)
     beyond, rest = (rms_of(left, rows) ** 2 - noise**2 for rows in (used, quiet))
     enough = np.minimum(LEAST_MOVING * judged.sum((0, 1)), ENOUGH_MOVING / problem.passed)
-    told = (beyond <= AS_MUCH * rms_of(np.sqrt(squares), used) ** 2) & (quiet.sum((0, 1)) >= enough)
-    told &= rest <= (tolerance * torque) ** 2
+    explained, without = rms_of(np.sqrt(squares), used) ** 2, quiet.sum((0, 1)) >= enough
+    told = without & (beyond <= AS_MUCH * explained) & (rest <= (tolerance * torque) ** 2)
+    told |= ~without & (beyond <= EVERYWHERE * explained)
     told |= rms_of(left - errors.mean(0), used) ** 2 - noise**2 <= (tolerance * torque) ** 2
     told &= held(state, left, still)
     return bool(large.any() and (told | rounded)[large].all())
