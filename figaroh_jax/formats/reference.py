@@ -46,7 +46,7 @@ KEYS: dict[str, tuple[str, str, str]] = {
     "data[].rate": ("Hz", "500", "`time` must name the column of the stamps"),
     "data[].velocity": ("rad/s, m/s", "dq", "the velocity is the derivative of the filtered position"),
     "data[].torque": ("N m, N", "tau", "a holdout recording is predicted; a fit recording needs it, or a command"),
-    "data[].command": ("rad, m", "u", "no rollouts: the recording is judged by its torque"),
+    "data[].command": ("rad, m; motors: N m, N", "u", "no rollouts: the recording is judged by its torque"),
     "data[].load.frame": ("", "tool0", "no payload is carried"),
     "data[].load.mass": ("kg", "2.0", "a load needs it"),
     "data[].load.com": ("m", "[0, 0, 0.05]", "the load is a point at the frame's origin"),

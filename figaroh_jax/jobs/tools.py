@@ -17,6 +17,7 @@ from ..reporting.provenance import read_provenance
 from ..reporting.run_directory import write_file
 
 if TYPE_CHECKING:
+    from ..recordings.dataset import Driven
     from ..recordings.draft import Draft
 
 __all__ = ["command_of", "compare", "list", "migrate", "new", "verify", "view"]
@@ -36,7 +37,12 @@ def new(args: argparse.Namespace) -> int:
         constants, gains = _numbers(args.constants, "--constants"), _numbers(args.kp, "--kp")
         known = {"rate": args.rate, "unit": args.unit, "topic": args.topic, "constants": constants, "gains": gains}
         gears = _numbers(args.gears, "--gears")
-        return draft_task(args.model, args.recordings, joints=joints, gears=gears, **known)
+        return draft_task(args.model, args.recordings, joints=joints, gears=gears, drives=drives, **known)
+
+    def drives(joints: Sequence[str]) -> tuple[Driven, ...]:
+        from ..rollouts.reading import driven_joints, load_loop
+
+        return driven_joints(load_loop(args.model, joints=joints)[0])
 
     draft = _asked(args, drafted) if args.interactive else drafted()
     if args.json:

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from ..formats.config import Load, RecordingEntry, Task
 
 __all__ = [
+    "Commanded",
     "Drive",
+    "Driven",
     "Memory",
     "Recording",
     "carried_body",
@@ -50,6 +52,18 @@ class Memory(NamedTuple):
         return f"recording '{self.name}'"
 
 
+Commanded = Literal["position", "velocity", "torque"]
+
+
+class Driven(NamedTuple):
+    """A joint that drives act at, and what they are commanded."""
+
+    joint: str
+    command: Commanded = "position"
+    drives: tuple[str, ...] = ()  # names
+    gain: float | None = None  # of a command that is a torque: that of the joint (N m or N) per unit
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """One recording on the joint side: rad and N m, or m and N for prismatic joints; see `figaroh_jax.recording`.
@@ -65,7 +79,7 @@ class Recording:
     position: Float[np.ndarray, "samples nq"]  # with quaternions x y z w where the robot has any
     velocity: Float[np.ndarray, "samples nv"] | None = None
     torque: Float[np.ndarray, "samples nv"] | None = None
-    command: Float[np.ndarray, "samples nv"] | None = None  # commanded position
+    command: Float[np.ndarray, "samples nv"] | None = None  # commanded position; of rollouts what the drives take
     load: Load | None = None  # known payload carried
     repeat: str | None = None  # recordings with one label repeat one excitation
     role: Literal["fit", "holdout"] = "fit"
@@ -77,15 +91,16 @@ class Recording:
 
 
 def read_recordings(
-    task: Task, model: RobotModel, *, floating: bool = False, rollouts: bool = False, driven: Sequence[str] = ()
+    task: Task, model: RobotModel, *, floating: bool = False, rollouts: bool = False, driven: Sequence[Driven] = ()
 ) -> tuple[Recording, ...]:
     """Read every recording of a task of torque level, or of `rollouts` (a command in place of torque), in its order.
 
     With `floating` the root may be a free joint: the position then begins with its origin and quaternion (x y z, x
     y z w), the torque with the measured wrench on it, force and torque about its origin in its own axes. Where
-    fewer joints are `driven` than move, commands may have a column for each of these alone. Raises `InputError`
-    that names the file, the key, the row or the joint: missing or damaged files and columns, NaN, wrong shapes,
-    time that does not increase, names that the model does not know, a fit recording without torque.
+    fewer joints are `driven` than move, commands may have a column for each of these alone; a commanded torque keeps
+    its unit (N m or N), whatever that of the positions. Raises `InputError` that names the file, the key, the row or
+    the joint: missing or damaged files and columns, NaN, wrong shapes, time that does not increase, names that the
+    model does not know, a fit recording without torque.
 
     >>> import figaroh_jax as fj
     >>> task = fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml"))
@@ -192,7 +207,7 @@ class Drive:
         return motor if self.torque is None else motor @ self.torque.T
 
 
-def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive, driven: Sequence[str] = ()) -> Recording:
+def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive, driven: Sequence[Driven] = ()) -> Recording:
     table = read_table(entry.file, f"{key}.file", Source(entry.format, entry.topic, entry.episode))
     units = entry.units
     angle = unit_factors(units.position, drive.position is not None, model)
@@ -204,7 +219,7 @@ def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive, driv
         return None if source is None else _columns(table, source, columns, f"{key}.{name}", len(position))
 
     velocity, torque = optional("velocity", model.dof_names), optional("torque", model.dof_names)
-    command = _of_the_drives(table, entry.command, optional, position_names(model), driven)
+    command = _of_the_drives(table, entry.command, optional, position_names(model), [one.joint for one in driven])
     if torque is not None and units.torque in _NO_TORQUE and drive.torque is None:
         raise InputError(
             f"{entry.file}: {key}.units.torque is {units.torque}: transmission.torque must say what one"
@@ -221,12 +236,28 @@ def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive, driv
         position=drive.joint_motion(position) + drive.offset,
         velocity=None if velocity is None else drive.joint_motion(velocity * rate),
         torque=None if torque is None else drive.joint_torque(torque),
-        command=None if command is None else drive.joint_motion(command * angle) + drive.offset,
+        command=None if command is None else _commanded(command, angle, rate, drive, model, driven),
         load=entry.load,
         repeat=entry.repeat,
         role=entry.role,
         notes=_clock_beside(table, entry, len(position)),
     )
+
+
+def _commanded(
+    command: np.ndarray,
+    angle: np.ndarray,
+    rate: np.ndarray,
+    drive: Drive,
+    model: RobotModel,
+    driven: Sequence[Driven],
+) -> np.ndarray:
+    """Commands on the joint side: positions, and of drives that take another quantity velocities and torques."""
+    found, kinds = drive.joint_motion(command * angle) + drive.offset, {one.joint: one.command for one in driven}
+    for kind in set(kinds.values()) - {"position"}:
+        other = drive.joint_torque(command) if kind == "torque" else drive.joint_motion(command * rate)
+        found = np.where([kinds.get(name) == kind for name in model.dof_names], other, found)
+    return found
 
 
 def _of_the_drives(

@@ -6,7 +6,7 @@ can. What stays open is refused, what was assumed is said in the draft's comment
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,11 +15,10 @@ from jaxtyping import Float
 
 from ..errors import InputError, nearest
 from ..formats.config import RecordingEntry
-from ..formats.files import USD
 from ..formats.robotfile import read_robot
 from ..rigid.model import DOF_NAMES, RobotModel, prismatic
 from .checks import DEGREE, Finding, check_recording, position_findings
-from .dataset import Recording
+from .dataset import Driven, Recording
 from .draft_columns import Columns, Undecided, read_columns, without_sign
 from .likeness import FEWEST, Sampled, likeness, rigid_torque, sampled
 from .torque_checks import TURNED_POSITION
@@ -48,12 +47,14 @@ def draft_task(
     topic: str | None = None,
     gains: Sequence[float] | None = None,
     gears: Sequence[float] | None = None,
+    drives: Callable[[Sequence[str]], Sequence[Driven]] = lambda joints: (),
 ) -> Draft:
     """A task for `diagnose` and `identify` on these recordings; `joints` names their columns, `rate` (Hz) their clock.
 
     `constants` are N m a unit of each torque column, `gears` motor turns a joint turn where positions are those of
     motors, `gains` the proportional gains of the position servos (N m/rad), all in the order of the joints; `unit`
-    (rad, deg, m, mm) is that of the positions, `topic` that of bags.
+    (rad, deg, m, mm) is that of the positions, `topic` that of bags. `drives` tells the drives in the model's file of
+    the joints that move; `gains` replace them.
 
     Raises `InputError` for what cannot be read, and `Undecided` for what the data do not decide.
     """
@@ -63,7 +64,7 @@ def draft_task(
             raise InputError(f"--joints: robot '{whole.name}' has no joint '{name}'{nearest(name, whole.joint_names)}")
         if list(joints or ()).count(name) > 1:
             raise InputError(f"--joints: '{name}' is named twice")
-    reads = read_columns(files, whole, joints, rate, topic)
+    reads = read_columns(files, whole, joints, rate, topic, drives if gains is None else lambda joints: ())
     if len({read.joints for read in reads}) > 1:
         raise InputError("the recordings hold different joints; draft a task for each kind")
     robot = read_robot(model, reads[0].joints)
@@ -77,24 +78,32 @@ def draft_task(
     _doubt_percent(reads, unit)
     for option, given in (("--constants", constants), ("--gears", gears)):
         _check_factors(option, given, robot)
+    if len({tuple(one.joint for one in read.driven) for read in reads}) > 1:
+        raise InputError("the recordings hold commands of different joints; draft a task for each kind")
     reads, motors = _joint_side(robot, reads, gears)
     stated, unit = unit is not None, _unit_of_position(robot, reads) if unit is None else _stated_unit(robot, unit)
     factor = np.where(np.array(prismatic(robot)), {"deg": 1.0, "mm": 1e-3}.get(unit, 1.0), _degrees(unit))
-    reads = [
-        read._replace(position=read.position * factor, command=None if read.command is None else read.command * factor)
-        for read in reads
-    ]
+    reads = [_scaled(read, factor) for read in reads]
     signs, said = _torques(robot, reads) if constants is None else ([*constants], ["torque constants as given"])
     if constants is None and signs is not None:
         _refuse_turned_positions(robot, reads, gears)
-    drives, more = _drives(model, robot, reads, gains)
+    actuator, more = _drives(model, robot, reads, gains)
     said += more
     said += _refuse_what_is_wrong(robot, reads, signs, stated=constants is not None)
     labels = _repeats(reads)
     assumed += [*_locked_said(robot, whole), *motors, _unit_said(unit, robot, reads, stated)]
     assumed += [*said, *_repeats_said(reads, labels)]
-    text = _text(model, robot, whole, reads, unit, signs, labels, assumed, drives, gears, joints is not None)
+    text = _text(model, robot, whole, reads, unit, signs, labels, assumed, actuator, gears, joints is not None)
     return Draft(text, tuple(assumed))
+
+
+def _scaled(read: Columns, factor: Float[np.ndarray, " joints"]) -> Columns:
+    """Positions, and commands that are positions or velocities, times a factor for each joint."""
+    command = read.command
+    if command is not None:
+        moves = np.array([one.command != "torque" for one in read.driven])
+        command = command * np.where(moves, factor[[read.joints.index(one.joint) for one in read.driven]], 1.0)
+    return read._replace(position=read.position * factor, command=command)
 
 
 def _degrees(unit: str) -> float:
@@ -118,12 +127,7 @@ def _joint_side(
                 f" with their signs, in the order {names} (1 where a column is on the joint side already)",
             )
         return [*reads], []
-    ratio = np.asarray(gears)
-    turned = [
-        read._replace(position=read.position / ratio, command=None if read.command is None else read.command / ratio)
-        for read in reads
-    ]
-    return turned, [
+    return [_scaled(read, 1 / np.asarray(gears)) for read in reads], [
         f"gears as given; order, sign and unit of {names} are taken as they are, and nothing confirms that joints are"
         " uncoupled and share the model's zeros: see transmission.position and transmission.offset"
     ]
@@ -273,17 +277,32 @@ def _torques(robot: RobotModel, reads: Sequence[Columns]) -> tuple[list[float] |
 
 
 def _without_torque(robot: RobotModel, reads: Sequence[Columns]) -> list[str]:
-    if any(read.command is None for read in reads):
-        return ["the recordings hold no torque: neither diagnose nor identify can use them without"]
+    lacking = next((read for read in reads if read.command is None), None)
+    if lacking is not None:
+        raise InputError(
+            f"{lacking.file}: no column looks like a torque (tau, torque, effort), a current or a command (cmd, u,"
+            " target), and `diagnose` and `identify` need one of them; name such columns so, with their joints, as"
+            f" tau_{robot.dof_names[0]} or cmd_{robot.dof_names[0]}"
+        )
     said = [
         f"{read.unsigned} never changes its sign, so it is not torque: left out" for read in reads[:1] if read.unsigned
     ]
     said.append("the recordings hold no torque: rollouts of the command")
-    if not all(read.named for read in reads):
+    driven = reads[0].driven
+    passive = [name for name in robot.dof_names if name not in [one.joint for one in driven]]
+    if passive:
+        said.append(f"commands are of {', '.join(one.joint for one in driven)}; nothing drives {', '.join(passive)}")
+    if not all(read.named and read.drives_named for read in reads):
+        beyond = " beyond positions that follow their commands within the limits"
+        what = "the commands" if all(read.named for read in reads) else ", ".join(robot.dof_names)
         said.append(
-            f"order, sign and unit of {', '.join(robot.dof_names)} are taken as they are: no column names a joint, and"
-            " nothing confirms them beyond positions that follow their commands within the limits"
+            f"order, sign and unit of {what} are taken as they are: no column of theirs names a joint, and nothing"
+            f" confirms them{beyond * all(one.command == 'position' for one in driven)}"
         )
+    for kind, unit in (("torque", "N m or N"), ("velocity", "positions' unit per s")):
+        names = [one.joint for one in driven if one.command == kind]
+        if names:
+            said.append(f"the command at {', '.join(names)} is a {kind} ({unit}), as the model's actuators take it")
     return said
 
 
@@ -323,18 +342,25 @@ def _friction(motion: Sampled, joint: int) -> float:
     return float(x @ s / size) if size > 0 else 0.0
 
 
-def _order(robot: RobotModel, reads: Sequence[Columns], motions: Sequence[Sampled]) -> None:
-    """Refuse torque columns that another joint's motion explains much better than their own."""
+def _order(
+    robot: RobotModel,
+    reads: Sequence[Columns],
+    motions: Sequence[Sampled],
+    at: Sequence[int] | None = None,
+    what: str = "torque",
+) -> None:
+    """Refuse torque columns, of all joints or those `at`, that another one's motion explains much better than its."""
     from scipy.optimize import linear_sum_assignment
 
-    shares = np.mean([_explained(robot, motion) for motion in motions], axis=0)
+    at = range(robot.nv) if at is None else at
+    shares = np.mean([_explained(robot, motion) for motion in motions], axis=0)[np.ix_(at, at)]
     _, order = linear_sum_assignment(-shares)
-    names = robot.dof_names
+    names = [robot.dof_names[j] for j in at]
     for cycle in _cycles(order.tolist()):
         own, best = shares[cycle, cycle], shares[cycle, order[cycle]]
         if (best > CONFIRMED).all() and np.sum(np.log((1.02 - own) / (1.02 - best))) > np.log(6.0):
-            text = ", ".join(f"{names[j]} goes with the torque given for {names[order[j]]}" for j in cycle)
-            raise InputError(f"{reads[0].file}: torque and position columns are in different orders: {text}")
+            text = ", ".join(f"{names[j]} goes with the {what} given for {names[order[j]]}" for j in cycle)
+            raise InputError(f"{reads[0].file}: {what} and position columns are in different orders: {text}")
 
 
 def _cycles(order: list[int]) -> Iterator[list[int]]:
@@ -459,22 +485,45 @@ def _drives(
         return {}, []
     for read in reads:
         assert read.command is not None
-        for j, name in enumerate(robot.dof_names):
-            if np.std(read.command[:, j]) > 1e-3 and np.corrcoef(read.command[:, j], read.position[:, j])[0, 1] < 0.5:
+        for one, u in zip(read.driven, read.command.T, strict=True):
+            q = read.position[:, robot.joint_names.index(one.joint)]
+            if one.command == "position" and np.std(u) > 1e-3 and not np.corrcoef(u, q)[0, 1] >= 0.5:
+                servo = f"its drive {one.drives[0]} takes" if one.drives else "a servo of --kp takes"
                 raise InputError(
-                    f"{read.file}: the position of {name} does not follow its command: order, sign or unit?"
+                    f"{read.file}: the position of {one.joint} does not follow its command: order, sign or unit?"
+                    f" {servo[0].upper()}{servo[1:]} a position. Name each column after its joint, as cmd_{one.joint};"
+                    f" where the command is a torque, the model needs a `motor` at {one.joint} (MJCF), or a task"
+                    " `kind: torque` under `actuator`"
                 )
+    _order_of_motors(robot, reads)
+    names = [one.joint for one in reads[0].driven]
     if gains is not None:
-        if len(gains) != robot.nv:
-            raise InputError(f"--kp: {len(gains)} numbers, expected one for each of {', '.join(robot.dof_names)}")
-        return {n: {"kind": "position", "kp": k} for n, k in zip(robot.dof_names, gains, strict=True)}, []
-    if model.suffix.lower() in (".xml", *USD):
+        if len(gains) != len(names):
+            raise InputError(f"--kp: {len(gains)} numbers, expected one for each of {', '.join(names)}")
+        return {n: {"kind": "position", "kp": k} for n, k in zip(names, gains, strict=True)}, []
+    if any(one.drives for one in reads[0].driven):
         return {}, ["the drives are the model's actuators"]
     raise Undecided(
         "kp",
-        f"{model}: a command without torque is simulated with its drives, which a URDF does not describe: give the"
-        f" gains of the position servos by --kp (N m/rad, in the order {', '.join(robot.dof_names)}), or an MJCF",
+        f"{model}: a command without torque is simulated with its drives, and this file has none: give the gains of"
+        f" the position servos by --kp (N m/rad, in the order {', '.join(names)}), or an MJCF with actuators",
     )
+
+
+def _order_of_motors(robot: RobotModel, reads: Sequence[Columns]) -> None:
+    """Refuse commands of motors that another joint's motion explains much better than their own."""
+    at = [robot.joint_names.index(one.joint) for one in reads[0].driven]
+    gain = [one.gain for one in reads[0].driven if one.command == "torque" and one.gain is not None]
+    if len(gain) < max(len(at), 2):
+        return
+    motions = []
+    for read in reads:
+        torque = np.zeros_like(read.position)
+        torque[:, at] = np.asarray(read.command) * gain
+        motion = sampled(read.time, read.position, torque)
+        motions += [] if motion is None else [motion]
+    if motions:
+        _order(robot, reads, motions, at, "command")
 
 
 # Words

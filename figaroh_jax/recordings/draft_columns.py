@@ -7,7 +7,7 @@ model. What names leave open is `Undecided`, with the option of the command that
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from ..errors import InputError
 from ..rigid.model import RobotModel
+from .dataset import Driven
 from .reading import BAGS, kind_of, lerobot_episodes, read_table
 from .tables import Source, Table
 
@@ -48,11 +49,14 @@ _HUGE = 1e12  # beyond it no column is a recording in any unit
 
 
 class Undecided(InputError):
-    """What the data cannot decide; `option` is the option of the command by which a user does."""
+    """What the data cannot decide; `option` is the option of `new` by which a user does.
 
-    def __init__(self, option: str, text: str) -> None:
-        super().__init__(text)
-        self.option = option
+    The message says `what` is open, then the `advice` to use that option, which other commands do not have.
+    """
+
+    def __init__(self, option: str, what: str, advice: str = "") -> None:
+        super().__init__(what + advice)
+        self.option, self.what = option, what
 
 
 class Columns(NamedTuple):
@@ -66,7 +70,9 @@ class Columns(NamedTuple):
     position: Float[np.ndarray, "samples joints"]
     torque: Float[np.ndarray, "samples joints"] | None
     current: str  # unit of a torque that is none: "A", "mA", "%"; else empty
-    command: Float[np.ndarray, "samples joints"] | None = None
+    command: Float[np.ndarray, "samples driven"] | None = None
+    driven: tuple[Driven, ...] = ()  # of the columns of the command
+    drives_named: bool = True  # whether the command's names hold those of joints or drives
     unsigned: str = ""  # a torque beside the command that is left out: an absolute value
     motor: bool = False  # whether the names say that positions are those of motors
 
@@ -77,9 +83,10 @@ def read_columns(
     joints: Sequence[str] | None = None,
     rate: float | None = None,
     topic: str | None = None,
+    drives: Callable[[Sequence[str]], Sequence[Driven]] = lambda joints: (),
 ) -> list[Columns]:
     """The columns of every recording, in the joints' order of the model; `draft_task` says what may be given."""
-    return [_read(table, model, joints, rate, entry) for table, entry in _tables(files, topic)]
+    return [_read(table, model, joints, rate, entry, drives) for table, entry in _tables(files, topic)]
 
 
 def _tables(files: Sequence[Path], topic: str | None) -> Iterator[tuple[Table, dict[str, Any]]]:
@@ -110,7 +117,12 @@ _LOG_MARKS = {"rtde": {"actual_q_0"}, "libfranka": {"tau_J[0]", "state.tau_J[0]"
 
 
 def _read(
-    table: Table, model: RobotModel, joints: Sequence[str] | None, rate: float | None, entry: dict[str, Any]
+    table: Table,
+    model: RobotModel,
+    joints: Sequence[str] | None,
+    rate: float | None,
+    entry: dict[str, Any],
+    drives: Callable[[Sequence[str]], Sequence[Driven]],
 ) -> Columns:
     form = entry.get("format")
     if form is None:
@@ -128,13 +140,18 @@ def _read(
     if form is None or sources != _LOGGED[form]["position"]:
         entry = entry | {"position": sources}
     torque, current, command, unsigned = None, "", None, ""
+    driven, drives_named = (), True
     for kind in ("torque", "current", "velocity", "command"):
         if kind not in kinds or (kind in ("current", "command") and torque is not None):
             continue
-        own, source, by_name = _of_joints(table, kinds[kind], model, list(names), kind)
-        if own != names:
-            raise InputError(f"{table.file}: {kind} is of {', '.join(own)}, position of {', '.join(names)}")
-        values = _matrix(table, source, names, kind)
+        known = {one.joint: one for one in drives(names)} if kind == "command" else {}
+        if kind == "command":
+            own, source, by_name = _of_driven(table, kinds[kind], names, tuple(known.values()))
+        else:
+            own, source, by_name = _of_joints(table, kinds[kind], model, list(names), kind)
+            if own != names:
+                raise InputError(f"{table.file}: {kind} is of {', '.join(own)}, position of {', '.join(names)}")
+        values = _matrix(table, source, own, kind)
         if len(values) != len(position):
             raise InputError(f"{table.file}: {kind} has {len(values)} samples, position {len(position)}")
         key = "torque" if kind == "current" else kind
@@ -144,7 +161,9 @@ def _read(
         if form is None or source != _LOGGED[form].get(key):
             entry[key] = source
         if kind == "command":
-            command = values
+            kept = [k for k, joint in enumerate(own) if not known or joint in known]
+            command, driven = values[:, kept], tuple(known.get(own[k], Driven(own[k])) for k in kept)
+            drives_named = by_name
         elif kind != "velocity":
             torque, named = values, named and by_name
             current = _unit_of_current(source) if kind == "current" else ""
@@ -152,7 +171,8 @@ def _read(
     if form is not None and rate is None:
         del entry["time"]
     motor = bool(_MOTORS & set(_words(" ".join([sources] if isinstance(sources, str) else sources))))
-    return Columns(table.file, entry, names, named, time, position, torque, current, command, unsigned, motor)
+    commands = (command, driven, drives_named)
+    return Columns(table.file, entry, names, named, time, position, torque, current, *commands, unsigned, motor)
 
 
 _MOTORS = {"motor", "motors", "rotor", "rotors"}
@@ -318,6 +338,10 @@ def _kinds(table: Table, clock: str | None) -> dict[str, list[str]]:
         kind = name.partition(".")[0] if name.partition(".")[0] in _OF_BAGS else kind
         if name != clock and kind is not None and not name.startswith("/") and not _has_parts(name, table.names):
             found.setdefault("torque" if kind == "effort" else kind, []).append(name)
+    claimed = {name for names in found.values() for name in names} | {clock}
+    plain = [n for n in table.names if n not in claimed and {"u", "ctrl"} & {*_words(n)[:1], *_words(n)[-1:]}]
+    if "command" not in found and plain:
+        found["command"] = [name for name in plain if not _has_parts(name, table.names)]
     return {kind: _plainest(names) for kind, names in found.items()}
 
 
@@ -353,8 +377,9 @@ def _of_joints(
             left = [joint for joint in model.joint_names if joint not in by_name]
             raise Undecided(
                 "joints",
-                f"{table.file}: {kind}: which joints are {', '.join(rest)}? Name all joints by --joints, in the order"
-                f" of the columns {', '.join(columns)}; the model's others are {', '.join(left) or 'none'}",
+                f"{table.file}: {kind}: which joints are {', '.join(rest)}?",
+                f" Name all joints by --joints, in the order of the columns {', '.join(columns)}; the model's others"
+                f" are {', '.join(left) or 'none'}",
             )
         return names, [by_name[joint] for joint in names], True
     if len(columns) == 1 and table.read(columns[0]).ndim == 2:
@@ -373,12 +398,56 @@ def _of_joints(
     if joints is None and count != len(model.joint_names):
         raise Undecided(
             "joints",
-            f"{table.file}: {count} columns of {kind}, but the robot has {len(model.joint_names)} joints"
-            f" ({', '.join(model.joint_names)}); name theirs in the columns' order by --joints",
+            f"{table.file}: {count} column{'s'[: count != 1]} of {kind}, but the robot has"
+            f" {len(model.joint_names)} joints ({', '.join(model.joint_names)})",
+            f"; name the joints of {', '.join(columns[:12])} by --joints, in this order, or give the columns of all"
+            f" joints names such as {kind}_{model.joint_names[0]}",
         )
     if count != len(wanted):
         raise InputError(f"{table.file}: {count} columns of {kind}, but --joints names {len(wanted)}")
     return tuple(wanted), source, False
+
+
+def _of_driven(
+    table: Table, columns: list[str], joints: Sequence[str], driven: Sequence[Driven]
+) -> tuple[tuple[str, ...], Any, bool]:
+    """Joints of a command's columns, what the task says of them, and whether names decided it.
+
+    A column is of the joint whose name it holds, or of its drive's. Columns without such names are taken in the order
+    of the joints: one for each, or for those alone that have a drive. Of a robot file without drives (`driven` is
+    empty) the names say which joints have one, without names all.
+    """
+    wanted = [one.joint for one in driven] or list(joints)
+    for called in ({joint: (joint,) for joint in joints}, {one.joint: one.drives for one in driven}):
+        every = [name for names in called.values() for name in names]
+        own = {joint: [c for c in columns if any(_holds(c, n, every) for n in called[joint])] for joint in called}
+        twice = next((own[joint] for joint in wanted if len(own.get(joint, ())) > 1), None)
+        if twice:
+            raise InputError(
+                f"{table.file}: {' and '.join(twice)} look like commands of one joint, and a task has one command for"
+                " each; rename those that are none, or write a task whose `command` names the right columns"
+            )
+        of = tuple(joint for joint in joints if own.get(joint) and joint in wanted)
+        if of and (len(of) == len(wanted) or (not driven and len(of) == len(columns))):
+            return of, [own[joint][0] for joint in of], True
+    whole = len(columns) == 1 and table.read(columns[0]).ndim == 2
+    alike = len({re.sub(r"\d+", "#", name) for name in columns}) == 1
+    count = table.read(columns[0]).shape[1] if whole else len(columns)
+    of = tuple(wanted if count == len(wanted) else joints)
+    inside = sorted(columns, key=_number) if alike else columns
+    names = {joint: {joint}.union(*(one.drives for one in driven if one.joint == joint)) for joint in joints}
+    every = [name for each in names.values() for name in each]
+    held = [{joint for joint in joints if any(_holds(c, name, every) for name in names[joint])} for c in inside]
+    if count != len(of) or (not whole and any(own - {joint} for joint, own in zip(of, held, strict=True))):
+        few = f", of which {', '.join(wanted)} ha{'s' if len(wanted) == 1 else 've'} a drive" if driven else ""
+        raise InputError(
+            f"{table.file}: {count} column{'s'[: count != 1]} of a command ({', '.join(columns[:12])}), but the robot"
+            f" has {len(joints)} joint{'s'[: len(joints) != 1]} ({', '.join(joints)}){few}; give one column for each"
+            f" joint with a drive, with that joint in its name, as cmd_{wanted[0]}"
+        )
+    if not whole and not alike and not _one_set(columns):
+        raise InputError(f"{table.file}: several sets of columns look like a command: {', '.join(columns[:8])}")
+    return of, columns[0] if whole else inside, False
 
 
 def _one_set(columns: Sequence[str]) -> bool:
@@ -455,13 +524,8 @@ def read_commands(
     try:
         return _commands(table, drives, of, model, kinds, columns, rate)
     except Undecided as error:
-        what = (
-            str(error)
-            .split("Name all joints by --joints")[0]
-            .split("; name theirs in the columns' order by --joints")[0]
-        )
         more = "" if error.option == "rate" else "; name each column after its joint, or leave the positions out"
-        raise InputError(what.rstrip() + more) from None
+        raise InputError(error.what + more) from None
 
 
 def _commands(

@@ -15,11 +15,12 @@ from ..formats.mjcf import actuator_of, compile_mjcf, compiled_robot, disabled, 
 from ..formats.robotfile import read_robot, urdf_dynamics
 from ..formats.usd import UsdJoint, usd_joints
 from ..formats.xmlfile import find_in_packages
+from ..recordings.dataset import Commanded, Driven
 from ..rigid.manifold import neutral
 from ..rigid.model import RobotModel
 from .loop import Activation, Drives, Integrator, Joints, Loop, acts_across
 
-__all__ = ["joint_drives", "load_loop", "plain_joints"]
+__all__ = ["driven_joints", "joint_drives", "load_loop", "plain_joints"]
 
 _INTEGRATORS: dict[int, Integrator] = {0: "euler", 1: "rk4", 3: "implicitfast"}
 _SOLREF, _SOLIMP = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)  # MuJoCo's defaults
@@ -82,6 +83,27 @@ def load_loop(
         measured=tuple(range(robot.nv)),
     )
     return loop, notes
+
+
+def driven_joints(loop: Loop) -> tuple[Driven, ...]:
+    """The joints that have drives, in the robot's order, and what is commanded there."""
+    drives, found = loop.drives, list[Driven]()
+    way, gain, bias = (np.asarray(x) for x in (drives.transmission, drives.gain, drives.bias))
+    for k, joint in enumerate(loop.robot.dof_names):
+        own = [d for d in range(len(way)) if np.abs(way[d]).argmax() == k]
+        kinds: list[Commanded] = [_command_of(gain[d], bias[d], drives.activation[d]) for d in own]
+        alone = len(own) == 1 and np.count_nonzero(way[own[0]]) == 1 and not bias[own[0]].any()
+        if own:
+            kind = min(kinds, key=("position", "velocity", "torque").index)
+            names = tuple(drives.names[d] for d in own)
+            found.append(Driven(joint, kind, names, float(way[own[0], k] * gain[own[0], 0]) if alone else None))
+    return tuple(found)
+
+
+def _command_of(gain: np.ndarray, bias: np.ndarray, activation: Activation) -> Commanded:
+    if bias[1]:
+        return "velocity" if activation == "integrator" else "position"
+    return "velocity" if bias[2] and np.isclose(gain[0], -bias[2]) else "torque"
 
 
 def plain_joints(robot: RobotModel) -> Joints:

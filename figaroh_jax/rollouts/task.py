@@ -31,7 +31,7 @@ from .fit import Fit
 from .loop import Loop, alike, brought_back, turns
 from .own import left_out
 from .parameters import put, unit_of, values
-from .reading import load_loop
+from .reading import driven_joints, load_loop
 from .rest import nearest_of, parts_of, relative_rest
 from .search import Named, Search, search
 from .sensitivity import predicted
@@ -114,8 +114,7 @@ def read_rollouts(task: Task) -> tuple[Loop, tuple[Run, ...], tuple[str, ...]]:
             "actuator: {joint_1: {kind: position, kp: 20.0, kd: 0.5}}"
         )
     moved = np.abs(np.asarray(loop.drives.transmission)).argmax(1)
-    driven = [name for k, name in enumerate(loop.robot.dof_names) if k in moved]
-    recordings = read_recordings(task, loop.robot, rollouts=True, driven=driven)
+    recordings = read_recordings(task, loop.robot, rollouts=True, driven=driven_joints(loop))
     warnings = check_rollouts(task, loop.robot, recordings)
     runs, late = zip(*(_run(loop, r) for r in recordings), strict=True)
     periods = {regular(str(r.file), run.time) for r, run in zip(recordings, runs, strict=True)}
