@@ -195,6 +195,7 @@ def _simulate(args: argparse.Namespace) -> int:
         else:
             done.show(args.verbose)
             print(f"Motion: {out / 'simulation.csv'}")
+            print(f"Report: {out / 'report.html'}")
     return 0
 
 
@@ -358,7 +359,7 @@ def _add_tools(commands: Any) -> None:
     compare.add_argument("runs", type=Path, nargs="+", metavar="DIR")
     compare.add_argument("--out", type=Path, metavar="FILE.html", help="write a page with overlays too")
     compare.add_argument("--units", metavar="A,A,B,B", help="robot of each run: what differs between robots and days")
-    shown = "the robot of a run in a browser, with the named joints in colour; a design moving"
+    shown = "the robot of a run in a browser, with the named joints in colour; a design or simulation moving"
     view = commands.add_parser("view", help=shown)
     view.add_argument("--traceback", action="store_true", help="show where an error was raised")
     view.add_argument("run", type=Path, metavar="DIR")

@@ -230,6 +230,7 @@ def test_a_reader_that_goes_away_and_a_full_disk_at_standard_output(tmp_path: Pa
         {"options": ["--help"]},
         {"options": ["--out", "elsewhere"]},
         {"options": ["--backend"]},
+        {"options": ["--interpolate"]},
         {"task": [[]]},
         {"task": "a\0b"},
     ],
@@ -267,6 +268,10 @@ def test_rerun_uses_the_command_and_the_task_of_the_run(tmp_path: Path, monkeypa
     folder = run(tmp_path / "run", task, answer=ANSWER)
     assert tools.command_of(folder) == ("diagnose", str(task))
     made = json.loads((folder / "provenance.json").read_text())
+    design = made | {"command": "excite", "options": ["--from", str(folder)]}
+    (folder / "provenance.json").write_text(json.dumps(design))
+    assert tools.command_of(folder) == ("excite", str(task), "--from", str(folder))
+    (folder / "provenance.json").write_text(json.dumps(made))
     assert made["inputs"][0]["bytes"] == 9 and len(made["inputs"][0]["sha256"]) == 64 and "jax" in made["versions"]
     assert cli.main(["rerun", str(folder)]) == 2  # the task is none
     task.unlink()

@@ -1,21 +1,27 @@
 """`figaroh-jax simulate`: a run's model moved by a file of commands, against MuJoCo C and SciPy."""
 
 import json
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import browser
 import jax
 import mujoco as engine
 import numpy as np
 import pytest
 from schema import matches
 from scipy.integrate import solve_ivp
+from test_robot_view import Server
 from test_rollout_callback import NUMBERS, TWO, changed
 
 import figaroh_jax as fj
 from figaroh_jax.cli import main
+from figaroh_jax.errors import InputError
 from figaroh_jax.formats.export import write_model
 from figaroh_jax.recordings.reading import read_table
+from figaroh_jax.reporting.motion_view import show_simulation_run
 from figaroh_jax.rollouts.causes import elastic_loop
 from figaroh_jax.rollouts.data import Run
 from figaroh_jax.rollouts.loop import Loop
@@ -245,3 +251,102 @@ def test_a_file_without_a_clock_has_the_rate_that_is_stated(tmp_path: Path):
     written(tmp_path)
     file = saved(tmp_path / "plain.csv", cmd_j1=np.zeros(50), cmd_j2=np.zeros(50))
     np.testing.assert_allclose(ran(tmp_path, file, "--rate", "200")["time"], 0.005 * np.arange(50), rtol=0, atol=1e-9)
+
+
+def off_by(folder: Path, name: str, off: tuple[float, float], model: Path) -> Path:
+    """A recording of what MuJoCo C does with this robot's file, with positions that are off by so much."""
+    t = 0.002 * np.arange(600)
+    u = 0.3 * np.sin(t[:, None] * [4.0, 7.0])
+    q = in_mujoco(model / "robot.xml", u) + off
+    return saved(folder / name, time=t, cmd_a=u[:, 0], cmd_b=u[:, 1], q_j1=q[:, 0], q_j2=q[:, 1])
+
+
+def test_a_simulation_is_a_run_that_is_listed_repeated_and_compared(tmp_path: Path, capsys):
+    """The distances on its page are those by which the recording was moved."""
+    written(tmp_path)
+    file = off_by(tmp_path, "recording.csv", (0.01, -0.03), tmp_path / "run" / "model")
+    one = ran(tmp_path, file, "--start", "j1=0,j2=0", "--interpolate")
+    page = (tmp_path / "out" / "report.html").read_text().replace("\N{NO-BREAK SPACE}", " ")
+    assert "j2 is farthest from its measured position, 30 mrad RMS" in page and "figaroh-jax rerun" in page
+    assert '<td class="n" data-value="0.0' in page
+    assert main(["rerun", str(tmp_path / "out"), "--out", str(tmp_path / "again"), "--quiet"]) == 0
+    with np.load(tmp_path / "again" / "simulation.npz") as arrays:
+        np.testing.assert_array_equal(arrays["position"], one["position"])
+    off = off_by(tmp_path, "other.csv", (0.05, 0.0), tmp_path / "run" / "model")
+    words = ["simulate", str(tmp_path / "run"), "--command", str(off), "--start", "j1=0.1", "--quiet"]
+    assert main([*words, "--out", str(tmp_path / "third")]) == 0
+    capsys.readouterr()
+    assert main(["list", str(tmp_path), "--json"]) == 0
+    (section,) = json.loads(capsys.readouterr().out)
+    assert [(Path(row[0]).name, row[1]) for row in section["rows"]] == [
+        (name, "simulate") for name in ("again", "out", "third")
+    ]
+    runs = [str(tmp_path / name) for name in ("out", "again", "third")]
+    assert main(["compare", *runs, "--json", "--out", str(tmp_path / "page.html")]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    matches("compare", answer)
+    tables = {section["title"]: {row[0]: row[1:] for row in section["rows"]} for section in answer}
+    far = tables["RMS distance from the positions of the file"]
+    assert [float(far[j][0].split()[0]) for j in ("j1", "j2")] == pytest.approx([0.01, 0.03], abs=2e-4)
+    with np.load(tmp_path / "third" / "simulation.npz") as arrays:
+        apart = np.sqrt(np.mean((arrays["position"] - one["position"]) ** 2, axis=0))
+    between = tables["RMS distance from the first simulation (rad or m)"]
+    assert between["j1"][1] == "0" and float(between["j1"][2]) == pytest.approx(apart[0], rel=1e-3)
+    assert main(["compare", *runs, "--units", "a,a,b"]) == 2
+    assert "simulations hold no parameters" in capsys.readouterr().err
+    assert main(["compare", str(tmp_path / "out"), str(tmp_path / "run")]) == 2
+    assert "simulations are compared with simulations" in capsys.readouterr().err
+    assert main(["verify", str(tmp_path / "out")]) == 2
+    assert "runs of diagnose, identify and calibrate are verified" in capsys.readouterr().err
+    whole = (tmp_path / "third" / "simulation.npz").read_bytes()
+    for part in (b"", whole[: len(whole) // 2]):
+        (tmp_path / "third" / "simulation.npz").write_bytes(part)
+        assert main(["compare", *runs]) == 2
+        assert "simulation.npz: cannot be read" in capsys.readouterr().err
+    (tmp_path / "run").rename(tmp_path / "moved")
+    assert main(["rerun", str(tmp_path / "out")]) == 2
+    assert "is not there any more" in capsys.readouterr().err
+
+
+def test_the_view_plays_a_simulation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The joints stand where MuJoCo C has the bodies."""
+    loop = written(tmp_path)
+    t = 0.002 * np.arange(600)
+    u = 0.3 * np.sin(t[:, None] * [4.0, 7.0])
+    ran(tmp_path, saved(tmp_path / "commands.csv", time=t + 5.0, cmd_a=u[:, 0], cmd_b=u[:, 1]))
+    monkeypatch.setitem(sys.modules, "viser", SimpleNamespace(ViserServer=Server))
+    server: Any = show_simulation_run(tmp_path / "out", play=False)[0]
+    server.controls["time, s"].value = 0.8
+    server.controls["time, s"].calls[0]()
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "run" / "model" / "robot.xml"))
+    data = mujoco.MjData(model)
+    data.qpos[:] = in_mujoco(tmp_path / "run" / "model" / "robot.xml", u)[400]
+    mujoco.mj_kinematics(model, data)
+    places = [data.xanchor[model.joint(name).id] for name in loop.robot.dof_names]
+    np.testing.assert_allclose(server.drawn["/robot"][0][0][:, 1], places, rtol=0, atol=1e-6)
+    (tmp_path / "out" / "simulation.npz").write_bytes(b"")
+    with pytest.raises(InputError, match="the simulation cannot be read"):
+        show_simulation_run(tmp_path / "out")
+
+
+def test_browser_draws_a_simulation_with_and_without_positions(tmp_path: Path):
+    if browser.find() is None:
+        pytest.skip("no Chromium on this machine")
+    written(tmp_path)
+    file = off_by(tmp_path, "recording.csv", (0.01, -0.03), tmp_path / "run" / "model")
+    ran(tmp_path, file, "--start", "j1=0,j2=0")
+    columns = read_table(file, "recording")
+    few = {name: columns.vector(name, name) for name in ("time", "cmd_a", "cmd_b")}
+    words = ["simulate", str(tmp_path / "run"), "--command", str(saved(tmp_path / "few.csv", **few))]
+    assert main([*words, "--out", str(tmp_path / "bare"), "--quiet"]) == 0
+    assert "which holds no positions to compare with" in (tmp_path / "bare" / "report.html").read_text()
+    drawn = "document.querySelector('[data-joint=\"0\"] .plot').data"
+    with browser.page(tmp_path / "profile") as tab:
+        for folder, lines in (("out", ["measured", "simulated", "residual"]), ("bare", ["simulated"])):
+            tab.open(tmp_path / folder / "report.html", 1100, 900)
+            tab.wait(f"Boolean({drawn})")
+            assert tab.value(f"{drawn}.map(line => line.name)") == lines
+            assert tab.problems == []
+            if folder == "out":
+                residual = tab.value(f"{drawn}[2].y")
+                np.testing.assert_allclose(residual, 0.01, rtol=0, atol=2e-4)

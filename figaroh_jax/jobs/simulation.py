@@ -15,7 +15,10 @@ from ..effects.simulation import simulate as move
 from ..errors import InputError
 from ..formats.export import load_model
 from ..recordings.draft_columns import Commands, read_commands
+from ..reporting.motion_view import SIMULATION, model_folder
+from ..reporting.provenance import PROVENANCE, provenance
 from ..reporting.run_directory import check_directory, whole_directory
+from ..reporting.simulation_report import Motion, write_simulation
 from ..rigid.manifold import neutral
 from ..rigid.model import RobotModel
 from ..rollouts.causes import rigid
@@ -24,11 +27,10 @@ from ..rollouts.faults import refuse_other_units
 from ..rollouts.loop import Loop
 from ..rollouts.simulation import rollout
 from ..rollouts.stored import LOOP, read_loop
-from .run import Done, Progress
+from .run import REPORT, Done, Progress
 
-__all__ = ["SIMULATION", "simulate"]
+__all__ = ["simulate"]
 
-SIMULATION = "simulation"
 _SLOWEST = 0.02  # s between rows: a file of fewer is a list of set points, and the rows are those of the steps
 _STEP = 1e-3  # s, the longest step of a model of torques
 _SPAN, _FEW = 0.05, 5  # s and least rows of a parabola that tells how fast a recording without velocities begins
@@ -60,10 +62,10 @@ def simulate(
     A model of rollouts takes what its drives are commanded, one of torques the torques of its joints. It starts at
     `start` at rest (joints that it does not name at zero), else as the file's first rows say where it has
     positions, else at the model's zero at rest.
-    Written are `simulation.csv`, `simulation.npz` and `simulation.json`; with positions in the file also how far the
-    motion is from them.
+    Written are `simulation.csv`, `simulation.npz`, `simulation.json`, `report.html` and what made them; with positions
+    in the file also how far the motion is from them.
     """
-    folder = model / "model" if (model / "model" / "effects.yaml").is_file() else model
+    folder = model_folder(model)
     check_directory(out, [folder, file])
     if rate is not None and not 0 < rate < np.inf:
         raise InputError(f"--rate {rate:g}: a rate in Hz is a positive number")
@@ -99,12 +101,18 @@ def simulate(
     answer = _answer(folder, file, moved, given, plan, found, begun, interpolate)
     text = json.dumps(answer, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     progress("writing", 1.0)
+    options = ["--command", str(file.resolve()), *(["--columns", ",".join(columns)] if columns else [])]
+    options += [] if rate is None else ["--rate", repr(rate)]
+    options += [*(["--interpolate"] if interpolate else []), *([] if start is None else ["--start", start])]
     with whole_directory(out, [folder, file]) as work:
+        made = provenance("simulate", model, [*_files(folder), *_files(file)], "native", options)
+        (work / PROVENANCE).write_text(made, encoding="utf-8")
         (work / f"{SIMULATION}.json").write_text(text, encoding="utf-8")
         np.savez_compressed(work / f"{SIMULATION}.npz", allow_pickle=False, **found)
         head = ["t", *_names(robot), *(f"v.{name}" for name in robot.dof_names), *(f"u.{name}" for name in drives)]
         table = np.column_stack([found["time"], found["position"], found["velocity"], found["command"]])
         np.savetxt(work / f"{SIMULATION}.csv", table, "%.10g", ",", header=",".join(head), comments="")
+        write_simulation(_motion(moved, given, found), answer, robot, work / REPORT)
     return Done(answer, lambda: text, lambda verbose: print("\n".join(_summary(answer))))
 
 
@@ -228,15 +236,11 @@ def _answer(
     begun: str,
     interpolate: bool,
 ) -> dict[str, Any]:
-    robot, error = moved.robot, None
-    turns = dict(zip(robot.dof_names, robot.dofs.turns[np.argsort(robot.dofs.column)][: robot.nv], strict=True))
+    robot, error, unit = moved.robot, None, _units(moved.robot)
     if given.position is not None:
         at = [robot.dof_names.index(name) for name in given.joints]
         rms = np.sqrt(np.mean((found["reading"][:, at] - given.position) ** 2, axis=0))
-        error = {
-            name: {"rms": float(x), "unit": "rad" if turns[name] else "m"}
-            for name, x in zip(given.joints, rms, strict=True)
-        }
+        error = {name: {"rms": float(x), "unit": unit[name]} for name, x in zip(given.joints, rms, strict=True)}
     return {
         "format": 1,
         "robot": robot.name,
@@ -254,6 +258,31 @@ def _answer(
         "duration": float(found["time"][-1] - found["time"][0]),
         "error": error,
     }
+
+
+def _units(robot: RobotModel) -> dict[str, str]:
+    turns = robot.dofs.turns[np.argsort(robot.dofs.column)][: robot.nv]
+    return {name: "rad" if turning else "m" for name, turning in zip(robot.dof_names, turns, strict=True)}
+
+
+def _motion(moved: Loop | ExtendedModel, given: Commands, found: dict[str, np.ndarray]) -> Motion:
+    """What the page shows: the joints of one axis that have an encoder."""
+    robot, unit = moved.robot, _units(moved.robot)
+    single = [joint.name for joint in robot.joints if joint.kind in ("revolute", "prismatic")]
+    read = range(robot.nv) if isinstance(moved, ExtendedModel) else moved.measured
+    at = [k for k in read if robot.dof_names[k] in single]
+    names = tuple(robot.dof_names[k] for k in at)
+    measured = np.full((len(found["time"]), len(at)), np.nan)
+    for k, name in enumerate(given.joints if given.position is not None else ()):
+        measured[:, names.index(name)] = np.asarray(given.position)[:, k]
+    reading = found["reading"][:, [[*read].index(k) for k in at]]
+    units = tuple(unit[name] for name in names)
+    return Motion(names, units, found["time"], reading, found["velocity"][:, at], measured)
+
+
+def _files(path: Path) -> list[Path]:
+    """The file, or those of a folder."""
+    return [path] if path.is_file() else sorted(one for one in path.rglob("*") if one.is_file())
 
 
 def _summary(answer: dict[str, Any]) -> list[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -143,13 +143,14 @@ def compare(args: argparse.Namespace) -> int:
 
 
 def view(args: argparse.Namespace) -> int:
-    """The robot of a run in a browser, until the command is interrupted; of a design its motions."""
-    from ..reporting.motion_view import is_design, show_design_run
+    """The robot of a run in a browser, until the command is interrupted; of a design or a simulation its motion."""
+    from ..reporting.motion_view import is_design, is_simulation, show_design_run, show_simulation_run
     from ..reporting.robot_view import show_run
 
     if not 0 < args.port < 65536:
         raise InputError(f"--port {args.port}: expected a number from 1 to 65535")
-    server = show_design_run(args.run, args.port)[0] if is_design(args.run) else show_run(args.run, args.port)
+    moving = show_design_run if is_design(args.run) else show_simulation_run if is_simulation(args.run) else None
+    server = show_run(args.run, args.port) if moving is None else moving(args.run, args.port)[0]
     print(f"The robot of {args.run}: http://localhost:{args.port} (Ctrl-C ends)", file=sys.stderr, flush=True)
     try:
         server.sleep_forever()
@@ -173,23 +174,33 @@ def command_of(folder: Path) -> tuple[str, ...]:
     """The command line that made the run in `folder`, without `--out`; raises `InputError` where that is not said."""
     made = read_provenance(folder)
     options = [*made["options"]]
-    if made["command"] not in _RUNS or not _own_options(options):
+    if made["command"] not in _RUNS or not _own_options(options, _RUNS[made["command"]]):
         said = " ".join([made["command"], *options])[:200]
         raise InputError(f"{folder}: its provenance.json names a command that makes no run: {said}")
-    if not Path(made["task"]).is_file():
+    if made["command"] == "simulate" and not Path(made["task"]).is_dir():
+        raise InputError(f"{folder}: its model {made['task']} is not there any more; the motion is in simulation.csv")
+    if made["command"] != "simulate" and not Path(made["task"]).is_file():
         raise InputError(f"{folder}: its task {made['task']} is not there any more; its text is in provenance.json")
     return (str(made["command"]), str(made["task"]), *options)
 
 
-_RUNS = ("diagnose", "identify", "calibrate", "excite")
-_OPTIONS = {"--backend": 1, "--level": 1, "--no-priors": 0}  # that a run is said to have had, and their words
+_OPTIONS = {"--backend": 1}
+_RUNS: dict[
+    str, dict[str, int]
+] = {  # commands of runs, with the options that they are said to have had, and their words
+    "diagnose": _OPTIONS,
+    "identify": _OPTIONS,
+    "calibrate": _OPTIONS | {"--level": 1, "--no-priors": 0},
+    "excite": _OPTIONS | {"--from": 1},
+    "simulate": {"--command": 1, "--columns": 1, "--rate": 1, "--interpolate": 0, "--start": 1},
+}
 
 
-def _own_options(options: Sequence[str]) -> bool:
+def _own_options(options: Sequence[str], known: Mapping[str, int]) -> bool:
     """Whether the words are options that a run writes into its provenance, and nothing else."""
     waiting = [*options]
     while waiting:
-        count = _OPTIONS.get(waiting.pop(0))
+        count = known.get(waiting.pop(0))
         if count is None or any(word.startswith("-") for word in waiting[:count]) or len(waiting) < count:
             return False
         del waiting[:count]

@@ -46,11 +46,14 @@
     const below = { yaxis: "y2", xaxis: "x" };
     const traces = [];
     if (series.measured) traces.push(line("measured", series.measured, "measured", { width: 2.2 }));
-    traces.push(line("simulated before", series.before, "before", { dash: "dot" }));
-    traces.push(line("simulated after", series.after, "after"));
-    if (series.measured) {
+    const last = series.before ? " after" : ""; // one model alone has no before
+    if (series.before) traces.push(line("simulated before", series.before, "before", { dash: "dot" }));
+    traces.push(line("simulated" + last, series.after, "after"));
+    if (series.residualBefore) {
       traces.push({ ...line("residual before", series.residualBefore, "before", { width: 1.2 }), ...below });
-      traces.push({ ...line("residual after", series.residualAfter, "after", { width: 1.2 }), ...below });
+    }
+    if (series.measured) {
+      traces.push({ ...line("residual" + last, series.residualAfter, "after", { width: 1.2 }), ...below });
     }
     const both = Boolean(series.measured);
     const axes = { xaxis: { text: "time, s", options: { anchor: both ? "y2" : "y" } } };
@@ -67,10 +70,10 @@
       type: "scatter", mode: "markers", name, x: thin(series[key]), y: thin(y),
       marker: { color: colour(tone), size: 4, symbol, opacity: printing ? 1 : 0.6 },
     });
-    const traces = [
-      points("before", series.residualBeforeShown || series.residualBefore, "before", "circle-open"),
-      points("after", series.residualAfterShown || series.residualAfter, "after", "circle"),
-    ];
+    const traces = [points("after", series.residualAfterShown || series.residualAfter, "after", "circle")];
+    if (series.residualBefore) {
+      traces.unshift(points("before", series.residualBeforeShown || series.residualBefore, "before", "circle-open"));
+    }
     const text = key + ", " + (key === "velocity" ? joint.angle + "/s" : joint.angle);
     const axes = { xaxis: { text, options: {} }, yaxis: { text: "residual, " + joint.unit, options: {} } };
     return [traces, layout(colour, { axes, shapes: floor(colour, joint.noise, { x: "paper", y: "y" }) })];
@@ -83,7 +86,7 @@
     const stored = data.recordings[choice ? Number(choice.value) : 0][index];
     const series = Object.fromEntries(Object.entries(stored).map(([key, channel]) => [key, decode(channel)]));
     if (series.measured) {
-      series.residualBefore = minus(series.measured, series.before);
+      series.residualBefore = series.before && minus(series.measured, series.before);
       series.residualAfter = minus(series.measured, series.after);
     }
     const colour = colours();

@@ -1,4 +1,4 @@
-"""Designed motions and postures in a browser, with `viser` (extra `view`): the robot, its capsules, boxes around it.
+"""Designed and simulated motions in a browser, with `viser` (extra `view`): the robot, its capsules, boxes around it.
 
 Links are drawn as lines from joint to joint, so that no mesh is needed; where the design looked at distances, the
 capsules that it kept apart are drawn too.
@@ -23,16 +23,32 @@ from ..excitation.design import Design
 from ..excitation.task import clearance_asked, excite_block
 from ..formats.collision import rotation
 from ..formats.config import load_task
+from ..formats.export import load_model
 from ..formats.robotfile import load_robot
 from ..rigid.model import RobotModel
+from ..rollouts.stored import LOOP, read_loop
 from .provenance import read_provenance
 
 if TYPE_CHECKING:
     import viser  # pyright: ignore[reportMissingImports]
 
-__all__ = ["Played", "capsule_lines", "designed", "is_design", "show_design_run", "show_motion", "skeleton"]
+__all__ = [
+    "SIMULATION",
+    "Played",
+    "capsule_lines",
+    "designed",
+    "is_design",
+    "is_simulation",
+    "model_folder",
+    "show_design_run",
+    "show_motion",
+    "show_simulation_run",
+    "simulated",
+    "skeleton",
+]
 
 ANSWER = "excitation.json"
+SIMULATION = "simulation"  # what the files of `simulate` are called
 FRAMES = 25.0  # pictures a second
 _BODY, _SHELL, _BOX = (0, 114, 178), (150, 150, 150), (213, 94, 0)
 _RIM = 12  # corners of a circle
@@ -131,6 +147,45 @@ def designed(folder: Path) -> Played:
         raise InputError(f"{folder}: made for the joints {', '.join(joints)}; {task.file} has others now")
     asked = task.excite if still and task.excite is not None else excite_block(task.excite)
     return Played(robot, motions, clearance_asked(task, asked, robot)[0], still)
+
+
+def is_simulation(folder: Path) -> bool:
+    """Whether the folder holds a run of `simulate`."""
+    return (folder / f"{SIMULATION}.json").is_file()
+
+
+def model_folder(path: Path) -> Path:
+    """The folder of a model: `model` in a run directory, or the folder itself."""
+    return path / "model" if (path / "model" / "effects.yaml").is_file() else path
+
+
+def show_simulation_run(
+    folder: Path, port: int = 8080, *, play: bool = True
+) -> tuple[viser.ViserServer, Callable[[], None]]:
+    """The same of a run directory of `simulate`: what its model did."""
+    return _served(simulated(folder), port, play)
+
+
+def simulated(folder: Path) -> Played:
+    """The robot and the motion of a run directory of `simulate`; its times begin at zero.
+
+    Raises `InputError` where the run cannot be read, the model that it moved has gone, or a joint has several axes.
+    """
+    try:
+        joints = list(json.loads((folder / f"{SIMULATION}.json").read_text(encoding="utf-8"))["joints"])
+        with (folder / f"{SIMULATION}.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            time, q = np.asarray(arrays["time"], float), np.asarray(arrays["position"], float)
+    except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile):
+        raise InputError(f"{folder}: the simulation cannot be read; name a run directory of `simulate`") from None
+    model = model_folder(Path(read_provenance(folder)["task"]))
+    robot = read_loop(model).robot if (model / LOOP).is_file() else load_model(model).robot
+    if list(robot.dof_names) != joints:
+        raise InputError(f"{folder}: made of a model with the joints {', '.join(joints)}; {model} has others now")
+    if robot.nq != robot.nv:
+        raise InputError(
+            f"{folder}: view plays robots whose joints have one axis each; the motion is in simulation.csv"
+        )
+    return Played(robot, {"simulation": (time - time[0], q)}, None)
 
 
 def _served(shown: Played, port: int, play: bool) -> tuple[viser.ViserServer, Callable[[], None]]:

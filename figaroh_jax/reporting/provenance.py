@@ -21,12 +21,15 @@ _PACKAGES = ("figaroh-jax", "jax", "jaxlib", "equinox", "numpy", "scipy", "mujoc
 
 
 def provenance(command: str, task: Path, inputs: Iterable[Path], backend: str, options: Sequence[str] = ()) -> str:
-    """The text of `provenance.json`; `inputs` are the files that the task reads, its own among them."""
+    """The text of `provenance.json`; `inputs` are the files that the task reads, its own among them.
+
+    Of `simulate` the folder of the model stands in the place of the task.
+    """
     content: dict[str, Any] = {
         "command": command,
         "options": [*options, *(["--backend", backend] if backend != "native" else [])],
         "task": str(task.resolve()),
-        "task_text": task.read_text(encoding="utf-8", errors="replace"),
+        "task_text": task.read_text(encoding="utf-8", errors="replace") if task.is_file() else "",
         "inputs": [_hashed(path) for path in dict.fromkeys(p.resolve() for p in inputs)],
         "versions": {"python": platform.python_version()} | _versions(),
         "machine": {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()},

@@ -236,29 +236,44 @@ def _rank(candidate: Candidate) -> float:
 
 
 def plot_data(
-    floor: Float[np.ndarray, " nv"], units: Sequence[str], traces: Sequence[Trace], quantity: str = "torque"
+    floor: Float[np.ndarray, " nv"],
+    units: Sequence[str],
+    traces: Sequence[Trace],
+    quantity: str = "torque",
+    *,
+    alone: bool = False,
 ) -> str:
-    """What the plots are drawn from, as JSON that may stand inside a script element; `quantity` is compared."""
+    """What the plots are drawn from, as JSON that may stand inside a script element; `quantity` is compared.
+
+    `alone`: one model is shown, in place of one before and one after.
+    """
     count = len(units) * max(len(traces), 1)
     points = min(_POINTS, max(60, _PAGE_POINTS // count))
     joints = [
         {"noise": _finite(float(noise)), "unit": unit, "angle": "m" if unit in ("N", "m") else "rad"}
         for noise, unit in zip(floor, units, strict=True)
     ]
-    recordings = [_series(trace, points) for trace in traces]
+    recordings = [_series(trace, points, alone) for trace in traces]
     content = {"quantity": quantity, "joints": joints, "recordings": recordings}
     text = json.dumps(content, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")
 
 
-def _series(trace: Trace, points: int) -> list[dict[str, Any]]:
+def _series(trace: Trace, points: int, alone: bool) -> list[dict[str, Any]]:
     """The channels of one recording, joint by joint, thinned to `points` samples."""
-    misfit = trace.after if trace.measured is None else trace.measured - trace.before
-    kept = _thinned(np.asarray(misfit, np.float64), points)
     wide = {key: getattr(trace, key) for key in ("position", "velocity", "before", "after", "measured")}
+    misfit, seen = trace.after, np.zeros(np.shape(trace.after)[1], bool)
+    if trace.measured is not None:
+        seen = np.asarray(np.isfinite(np.asarray(trace.measured, np.float64)).any(axis=0))
+        misfit = np.where(seen, trace.measured - trace.before, trace.after)
+    kept = _thinned(np.asarray(misfit, np.float64), points)
     return [
         {"time": _packed(np.asarray(trace.time)[rows])}
-        | {key: _packed(np.asarray(value)[rows, joint]) for key, value in wide.items() if value is not None}
+        | {
+            key: _packed(np.asarray(value)[rows, joint])
+            for key, value in wide.items()
+            if (seen[joint] or key != "measured") and not (alone and key == "before")
+        }
         for joint, rows in enumerate(kept.T)
     ]
 

@@ -5,11 +5,13 @@ The first run is the reference. `rows` is the comparison as plain tables, which 
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -17,7 +19,7 @@ from ..errors import InputError, as_written
 from ..rigid.inertia import to_com
 from .provenance import PROVENANCE, read_provenance
 from .run_directory import MARKER
-from .verification import figures, read_run
+from .verification import SIMULATED, figures, read_run
 
 __all__ = ["PAGE", "Section", "compare_runs", "comparison_page", "comparison_text", "list_runs"]
 
@@ -33,7 +35,7 @@ class Section(NamedTuple):
 
 
 def compare_runs(folders: Sequence[Path], units: Sequence[str] | None = None) -> tuple[Section, ...]:
-    """The tables of a comparison; raises `InputError` where a folder is no run.
+    """The tables of a comparison; raises `InputError` where a folder is no run, or a simulation beside other runs.
 
     `units`: the robot of each run, by any label; runs of one label are days of one robot. From three runs on, what
     differs between robots and between days is a table of its own.
@@ -42,10 +44,55 @@ def compare_runs(folders: Sequence[Path], units: Sequence[str] | None = None) ->
         raise InputError(f"--units: {len(units)} labels for {len(folders)} runs; one for each is expected")
     if units is not None and len(folders) < 3:
         raise InputError("--units: at least three runs are needed to compare robots and days")
-    runs = [read_run(folder) for folder in folders]
     names = _names(folders)
+    if all((folder / SIMULATED).is_file() for folder in folders):
+        if units is not None:
+            raise InputError("--units: simulations hold no parameters that could differ between robots; leave it out")
+        with as_written(" or ".join(map(str, folders))):
+            return _simulations(folders, names)
+    runs = [read_run(folder) for folder in folders]
     with as_written(" or ".join(map(str, folders))):
         return (*_sections(folders, runs, names), *_spread(runs, units))
+
+
+def _simulations(folders: Sequence[Path], names: tuple[str, ...]) -> tuple[Section, ...]:
+    """How far simulations are from the positions of their files, and from each other where their rows are the same."""
+    told, moved = [], []
+    for folder in folders:
+        told.append(json.loads((folder / SIMULATED).read_text(encoding="utf-8")))
+        path = (folder / SIMULATED).with_suffix(".npz")
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                moved.append((arrays["time"], arrays["position"]))
+        except (OSError, EOFError, BadZipFile, ValueError, KeyError):
+            raise InputError(f"{path}: cannot be read; name run directories of `simulate`") from None
+    facts = [
+        (key, *(str(one[key]) for one in told))
+        for key in ("robot", "model", "command", "between_rows", "start", "step")
+    ]
+    errors = [one["error"] or {} for one in told]
+    distances = [
+        (joint, *(f"{one[joint]['rms']:.4g} {one[joint]['unit']}" if joint in one else "-" for one in errors))
+        for joint in dict.fromkeys(joint for one in errors for joint in one)
+    ]
+    (time, first), columns = moved[0], told[0]["joints"]
+    apart = []
+    if first.shape[1] == len(columns):
+        for k, joint in enumerate(columns):
+            row = [joint]
+            for one, (t, q) in zip(told, moved, strict=True):
+                same = joint in one["joints"] and len(t) == len(time) and np.allclose(t, time, rtol=0, atol=1e-6)
+                same = same and q.shape[1] == len(one["joints"])
+                gap = q[:, one["joints"].index(joint)] - first[:, k] if same else np.zeros(0)
+                row.append(f"{np.sqrt(np.mean(gap**2)):.4g}" if same else "-")
+            apart.append(tuple(row))
+    sections = (
+        Section("Simulations", ("simulation", *names), tuple(facts)),
+        Section("RMS distance from the positions of the file", ("joint", *names), tuple(distances)),
+        Section("RMS distance from the first simulation (rad or m)", ("joint", *names), tuple(apart)),
+        Section("Made by", ("made by", *names), tuple(_made(folders))),
+    )
+    return tuple(section for section in sections if section.rows)
 
 
 def _sections(folders: Sequence[Path], runs: Sequence[dict[str, Any]], names: tuple[str, ...]) -> tuple[Section, ...]:
@@ -87,7 +134,7 @@ def _spread(runs: Sequence[dict[str, Any]], units: Sequence[str] | None) -> tupl
 def list_runs(folder: Path) -> Section:
     """Every run below a folder, with what it found; files of the same names that no run wrote are passed over."""
     rows: list[tuple[str, ...]] = []
-    for marker in sorted({*folder.rglob("answer.json"), *folder.rglob("result.json")}):
+    for marker in sorted(path for name in _MARKERS for path in folder.rglob(name)):
         run = marker.parent
         if any(row[0] == str(run) for row in rows):
             continue
@@ -100,7 +147,12 @@ def list_runs(folder: Path) -> Section:
     return Section("Runs", ("directory", "command", "verdict", "causes", "held-out error", "time"), tuple(rows))
 
 
+_MARKERS = ("answer.json", "result.json", SIMULATED)
+
+
 def _row(run: Path) -> tuple[str, ...]:
+    if (run / SIMULATED).is_file():
+        return _simulation_row(run)
     found, made = figures(read_run(run)), {}
     if (run / PROVENANCE).is_file():
         made = read_provenance(run)
@@ -108,6 +160,14 @@ def _row(run: Path) -> tuple[str, ...]:
     causes = ", ".join(found["forbidden_causes"] or []) or "-"
     figure = (made.get("command", "?"), found["verdict"] or "-", causes, _number(held), made.get("time", "?"))
     return (str(run), *map(str, figure))
+
+
+def _simulation_row(run: Path) -> tuple[str, ...]:
+    content = json.loads((run / SIMULATED).read_text(encoding="utf-8"))
+    if not {"robot", "between_rows", "error"} <= content.keys():
+        raise KeyError("robot, between_rows or error is missing")
+    made = read_provenance(run) if (run / PROVENANCE).is_file() else {}
+    return (str(run), "simulate", "-", "-", "-", str(made.get("time", "?")))
 
 
 def _names(folders: Sequence[Path]) -> tuple[str, ...]:

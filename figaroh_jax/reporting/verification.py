@@ -15,9 +15,10 @@ from .run_directory import add_to_run
 if TYPE_CHECKING:
     from ..formats.config import Limits
 
-__all__ = ["DEFAULT_LIMITS", "JUNIT", "VERIFICATION", "Check", "figures", "junit", "read_run", "verify"]
+__all__ = ["DEFAULT_LIMITS", "JUNIT", "SIMULATED", "VERIFICATION", "Check", "figures", "junit", "read_run", "verify"]
 
 VERIFICATION = "verification.json"
+SIMULATED = "simulation.json"
 JUNIT = 'name="figaroh-jax verify '  # by which such a file is known
 _SIDES = {
     "verdict": "one of",
@@ -84,6 +85,11 @@ def read_run(folder: Path) -> dict[str, Any]:
             raise InputError(f"{path}: cannot be read as JSON: {error}") from None
         if found[key] is not None and not isinstance(found[key], dict):
             raise InputError(f"{path}: holds no object with keys, so no run wrote it")
+    if found["answer"] is None and found["result"] is None and (folder / SIMULATED).is_file():
+        raise InputError(
+            f"{folder}: holds a simulation; runs of diagnose, identify and calibrate are verified and compared"
+            " (answer.json or result.json), and simulations are compared with simulations"
+        )
     if found["answer"] is None and found["result"] is None:
         raise InputError(f"{folder}: has neither answer.json nor result.json, so it is not a run directory")
     return found
