@@ -185,9 +185,8 @@ def command_of(folder: Path) -> tuple[str, ...]:
 
 
 _OPTIONS = {"--backend": 1}
-_RUNS: dict[
-    str, dict[str, int]
-] = {  # commands of runs, with the options that they are said to have had, and their words
+# commands of runs, with the options that they are said to have had, and how many words each takes
+_RUNS: dict[str, dict[str, int]] = {
     "diagnose": _OPTIONS,
     "identify": _OPTIONS,
     "calibrate": _OPTIONS | {"--level": 1, "--no-priors": 0},
