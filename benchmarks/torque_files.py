@@ -1,11 +1,15 @@
 """Torques of published robots: `diagnose` of files that others wrote, with motions, errors and effects that are drawn.
 
     python benchmarks/torque_files.py FOLDER [FOLDER ...] --seeds 0 60 [--effects nothing payload] [--keep DIR]
+    python benchmarks/torque_files.py FOLDER --seeds 0 60 --effects nothing --commands identify
 
 Each case takes a URDF or an MJCF of the folders and draws which joints move (a branch, or any) and where the others are
 locked, gravity, how far the robot's links are off what the file says, its friction, the motion, the sampling, the noise
 and how the recordings are stored. Torques are those of Pinocchio (URDF) or of MuJoCo C (MJCF: exact inverse dynamics or
 a closed loop with friction that sticks). Half of the cases hide nothing, the others one effect.
+`identify` is asked of cases without an effect: MuJoCo C moves the `robot.xml` that it writes along a motion that is not
+in the data, and the torque is compared with that of the robot itself; it is `off` where the error at some joint is more
+than twice the noise.
 One line a case; at the end tables of verdicts, and every case with a name that is neither the truth nor said to be
 alike, an error or a warning.
 """
@@ -46,11 +50,23 @@ class Robot(NamedTuple):
     real: Callable[..., tuple[Torque, Any]]  # (gravity, errors of links, load) -> rigid torque, model of MuJoCo C
 
 
+class Forward(NamedTuple):
+    """A motion that is not in the data, of the joints that move (rows, joints)."""
+
+    names: list[str]
+    position: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    torque: np.ndarray
+    noise: np.ndarray  # of each joint's torque in the data
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--seeds", nargs=2, type=int, default=[0, 40], metavar=("FIRST", "END"))
     parser.add_argument("--effects", nargs="+", choices=["nothing", *HIDDEN], default=[])
+    parser.add_argument("--commands", nargs="+", choices=["diagnose", "identify"], default=["diagnose"])
     parser.add_argument("--most", type=int, default=6, help="joints that move")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="leave the cases and their runs there")
     args = parser.parse_args()
@@ -64,12 +80,15 @@ def main() -> None:
         while found is None:
             robot = read(files[int(rng.integers(len(files)))])
             found = robot and drawn(robot, rng, args)
-        case, same = found
-        marks, lines = answered(case, same, args.keep and args.keep / str(seed))
-        line = f"{seed}: {case.told}\n    {lines[0]}"
+        case, same, forward = found
+        jobs = [job for job in args.commands if job == "diagnose" or case.truth is None]
+        marks, lines = answered(case, same, forward, jobs, args.keep and args.keep / str(seed))
+        line = f"{seed}: {case.told}\n    " + "\n    ".join(lines)
         print(line, flush=True)
-        count[case.truth[0] if case.truth else "nothing", marks[0]] += 1
-        if marks[0] in ("wrong", "error", "warning"):
+        for job, mark in zip(jobs, marks, strict=True):
+            effect = case.truth[0] if case.truth else "nothing"
+            count[effect if job == "diagnose" else job, mark] += 1
+        if any(mark in ("wrong", "off", "error", "warning") for mark in marks):
             odd.append(line)
     for (effect, mark), number in sorted(count.items()):
         print(f"{effect:40} {mark:10} {number}")
@@ -217,8 +236,9 @@ def _carried(model: Any, body: int, mass: float, place: np.ndarray) -> None:
 
 def drawn(
     robot: Robot, rng: np.random.Generator, args: argparse.Namespace
-) -> tuple[Case, Callable[[tuple[str, str]], bool]] | None:
-    """A case and what counts as its truth, or None where nothing weighs on the joints or the loop does not follow."""
+) -> tuple[Case, Callable[[tuple[str, str]], bool], Forward] | None:
+    """A case, what counts as its truth and a motion that is not in its data, of all joints with the torque of each that
+    moves and its noise; None where nothing weighs on the joints or the loop does not follow."""
     n = len(robot.names)
     effect = str(rng.choice(args.effects or (["nothing"] if rng.random() < 0.5 else list(HIDDEN))))
     some = int(rng.integers(1, min(n, args.most) + 1))
@@ -347,7 +367,11 @@ def drawn(
         alike = name[0] == truth[0] or any({name[0], truth[0]} <= names for names in ALIKE)
         return alike and (name[1] == at or (effect == "payload" and mover(name[1]) == mover(at)))
 
-    return Case(told, task, {}, recordings, "npz", truth, {}), same
+    q, v, a = (x[::5] for x in _reference(rng, "waves", 8.0, 0.001, travel, moving, 0.8 * fast))
+    rubbed = torque(q + start, v, a) + viscous * v + dry * np.sign(v)
+    names = [robot.names[k] for k in moving]
+    ahead = Forward(names, *(x[:, moving] for x in (q + start, v, a, rubbed)), noise * load[moving])
+    return Case(told, task, {}, recordings, "npz", truth, {}), same, ahead
 
 
 def _push(hidden: tuple[str, int, float, np.ndarray], q: np.ndarray, start: float, travel: float) -> np.ndarray:
@@ -372,10 +396,35 @@ def _sizes(
     return inertia, np.abs(weights).mean(0) * still
 
 
-def answered(case: Case, same: Callable[[tuple[str, str]], bool], keep: Path | None) -> tuple[list[str], list[str]]:
-    """How `diagnose` did, in a word and in a line."""
+def answered(
+    case: Case,
+    same: Callable[[tuple[str, str]], bool],
+    forward: Forward,
+    jobs: list[str],
+    keep: Path | None,
+) -> tuple[list[str], list[str]]:
+    """How each command did, in a word and in a line."""
+
+    def judged(folder: Path, job: str) -> tuple[str, str]:
+        return diagnosed(folder / job, same) if job == "diagnose" else _predicts(folder / job, forward)
+
     with written(case, keep) as folder:
-        return asked(folder, ["diagnose"], lambda job: diagnosed(folder / job, same))
+        return asked(folder, jobs, lambda job: judged(folder, job))
+
+
+def _predicts(run: Path, forward: Forward) -> tuple[str, str]:
+    """Whether the identified robot, as MuJoCo C reads its file, has the torque of the robot itself."""
+    model = MADE.MjModel.from_xml_path(str(run / "model" / "robot.xml"))
+    model.opt.disableflags |= int(MADE.mjtDisableBit.mjDSBL_CONSTRAINT)
+    data, at = MADE.MjData(model), [forward.names.index(model.joint(k).name) for k in range(model.njnt)]
+    rows = []
+    for q, v, a in zip(forward.position, forward.velocity, forward.acceleration, strict=True):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q[at], v[at], a[at]
+        MADE.mj_inverse(model, data)
+        rows.append(data.qfrc_inverse + model.dof_frictionloss * np.sign(v[at]))
+    error = np.sqrt(np.mean((np.array(rows) - forward.torque[:, at]) ** 2, axis=0)) / forward.noise[at]
+    told = ", ".join(f"{x:.2g}" for x in error)
+    return "off" if error.max() > 2 else "right", f"error on another motion, of the noise: {told}"
 
 
 if __name__ == "__main__":
