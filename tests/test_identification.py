@@ -151,6 +151,11 @@ def test_a_dead_torque_is_refused_and_said(truth: Truth):
     assert any("torque of elbow is not fitted" in note for note in found.notes)
     assert np.isnan(found.fit.rms[1]) and np.isfinite(found.fit.rms[[0, 2]]).all()
     assert json.loads(to_json(found))["fit"]["rms"][1] is None
+    unseen = [e for e in json.loads(to_json(found))["effects"] if e["at"] == ["elbow"]]
+    assert [x for e in unseen for x in e["parameters"].values()] == [
+        {"value": 0.0, "std": None, "unit": "N m s/rad"},
+        {"value": 0.0, "std": None, "unit": "N m"},
+    ]
 
 
 def test_only_the_joints_asked_for_are_fitted(truth: Truth):

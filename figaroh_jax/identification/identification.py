@@ -236,7 +236,7 @@ def _judged(
     rows = [np.asarray(t.after) - t.measured for t in traces if t.role == "fit" and t.measured is not None]
     weighted = np.concatenate([(row * np.sqrt(problem.weight)).reshape(-1) for row in rows])
     kept = essential(data.factor(problem.weight)[:, [*base.independent, -1]])
-    sigma = np.sqrt(np.maximum(np.diag(posterior)[own:], 0.0))
+    sigma = np.where(_unseen(problem), np.inf, np.sqrt(np.maximum(np.diag(posterior), 0.0)))[own:]
     return Identification(
         solution=solution_of(regression, last.fit, posterior, base.rank, weighted),
         joints=model.dof_names,
@@ -423,9 +423,16 @@ def _fitted(problem: _Problem, folds: Sequence[int] | None, slack: float, everyw
         failure = "" if found.converged else f"log_cholesky has not converged in {found.steps} steps; try 'physical'"
         return Solved(found.parameters, failure, found.steps)
     try:
-        return Solved(physical_fit(factor, problem.links, problem.bounded))
+        theta = physical_fit(factor, problem.links, problem.bounded)
+        return Solved(np.where(_unseen(problem), problem.mean, theta))
     except NotConverged as error:
         return Solved(problem.mean, str(error))
+
+
+def _unseen(problem: _Problem) -> Bool[np.ndarray, " columns"]:
+    """Friction and rotors in no row that is fitted: a solver of cones leaves them anywhere above their bound."""
+    drives = np.arange(len(problem.mean)) >= problem.nominal.size
+    return drives & ~problem.data.factor(problem.weight)[:, :-1].any(axis=0)
 
 
 def _given_links(problem: _Problem) -> Float[np.ndarray, " columns"]:

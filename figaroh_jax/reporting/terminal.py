@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from types import TracebackType
@@ -242,5 +243,5 @@ def _qualities(found: Identification) -> RenderableType:
     last = list(found.holdout.values())[-1] if found.holdout else found.validated
     for j, (joint, unit) in enumerate(zip(found.joints, found.torque_units, strict=True)):
         values = [wording.number(float(quality.rms[j]), 3) for quality in columns.values()]
-        table.add_row(Text(joint), *values, f"{last.r2[j]:.4f}", unit)
+        table.add_row(Text(joint), *values, f"{last.r2[j]:.4f}" if math.isfinite(last.r2[j]) else "–", unit)
     return table

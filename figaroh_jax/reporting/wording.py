@@ -314,10 +314,11 @@ def interval(estimate: Estimate) -> str:
     """Value with its 95 % interval and unit: "0.0113 ± 0.0004 kg m²"; without an interval where there is none.
 
     Where half of it would be below what the number can be, it is cut there: "0.42 (0 to 1.6) N m".
-    An angle that may lie anywhere on the turn has no value: where a spring rests, beside a free torque offset.
+    What no row shows has no value, nor has an angle that may lie anywhere on the turn: where a spring rests, beside a
+    free torque offset.
     """
     half = _NORMAL_95 * estimate.std
-    if estimate.unit == "rad" and half > 2 * math.pi:
+    if math.isinf(half) or (estimate.unit == "rad" and half > 2 * math.pi):
         return "not determined by this data"
     if not (math.isfinite(half) and half > 0.0):
         return _with_unit(number(estimate.value), estimate.unit)
