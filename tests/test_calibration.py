@@ -77,6 +77,15 @@ def test_offsets_and_compliance_are_found_and_named(calibrated: Calibration):
     assert {cause.name.effect for cause in calibrated.causes} == {"outlier", "joint_offset", "joint_compliance"}
 
 
+def test_a_joint_whose_name_has_spaces_is_one_joint(tmp_path: Path):
+    rng = np.random.default_rng(3)
+    task = recorded(tmp_path, rng, poses.truth(rng, offset=OFFSET))
+    robot = tmp_path / "robot.urdf"
+    robot.write_text(robot.read_text().replace('"j5"', '"wrist axis 5"'))
+    offsets = [c.name.at for c in calibrate_task(load_task(task)).causes if c.name.effect == "joint_offset"]
+    assert ("wrist axis 5",) in offsets
+
+
 def test_a_calibration_is_a_view_of_its_fit(calibrated: Calibration):
     """Numbers, their sigmas and the rows of its data are those of the public residual of its model."""
     fit = calibrated.solution

@@ -197,7 +197,7 @@ def causes_of(
     fall = Gain(scale * table["frames"][channel], scale * table["joint_offset"][channel], unit)
     offsets = [p for p in parameters if p.name.startswith("joint_offset") and p.status == "identified"]
     found = [
-        Cause(Name("joint_offset", tuple(p.name.split()[1:])), {"offset": Estimate(p.value, p.std, p.unit)}, 1.0, fall)
+        Cause(Name("joint_offset", (p.name.split(" ", 1)[1],)), {"offset": Estimate(p.value, p.std, p.unit)}, 1.0, fall)
         for p in sorted(offsets, key=lambda p: -abs(p.value))
         if level != "frames" and abs(p.value) > thresholds.OFFSET_SIGMAS * np.hypot(p.std, thresholds.OFFSET)
     ]
