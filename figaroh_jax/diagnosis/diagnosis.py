@@ -19,6 +19,7 @@ from ..compiled.memory import give_back_holes
 from ..effects.base import place
 from ..effects.catalogue import CATALOGUE, find, related
 from ..effects.plausibility import implausible
+from ..errors import InputError
 from ..formats.assembly import Welded
 from ..formats.robotfile import load_robot, stated_baseline, welded_to
 from ..recordings.bandwidth import note_on
@@ -85,6 +86,7 @@ def diagnose_task(
     progress("reading", 0.0)
     model, (known, notes) = load_robot(task), stated_baseline(task)
     recordings = read_recordings(task, model)
+    _refuse_unmeasured(model, recordings)
     checked = checked_recordings(task, model, recordings)
     notes = (*notes, *checked.warnings)
     options: dict[str, Any] = {
@@ -128,6 +130,7 @@ def diagnose(
     with jax.enable_x64(True):
         progress("preparing signals", 0.03)
         backend = as_backend(model)
+        _refuse_unmeasured(backend.robot, recordings)
         signals, band, begun = prepared_signals(backend, recordings, preprocess, known, trust)
         here = setting_of(*begun, forbid, progress)
         ordered = sorted(recordings, key=lambda r: r.role == "holdout")
@@ -165,6 +168,24 @@ class _Judged(NamedTuple):
     sticks: bool  # whether what is left is that of joints at rest
     here: Setting  # with the weights of the answer's fit
     more: str = ""  # data that would tell what is left from noise, in words, where these do not
+
+
+def _refuse_unmeasured(robot: RobotModel, recordings: Sequence[Recording]) -> None:
+    """Refuse a joint whose torque has one value in a recording of the fit: every joint is judged by its torque."""
+    for one in recordings:
+        if one.role != "fit" or one.torque is None:
+            continue
+        dead = np.flatnonzero(np.ptp(one.torque, axis=0) == 0)
+        if 0 < dead.size < one.torque.shape[1]:  # of all joints: `check_recordings` says so
+            j = int(dead[0])
+            still = (
+                f"; it stands still: name the other joints in robot.joints, and {robot.dof_names[j]} in robot.posture"
+            )
+            moves = "; identify leaves such a joint out, a diagnosis judges every joint by its torque"
+            raise InputError(
+                f"{one.file}: the torque of {robot.dof_names[j]} is {one.torque[0, j]:g} in every row: it was not"
+                f" measured{still if np.ptp(one.position[:, j]) == 0 else moves}"
+            )
 
 
 def _searched(

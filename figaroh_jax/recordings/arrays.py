@@ -189,7 +189,10 @@ def _matrix(x: ArrayLike, key: str, source: Memory) -> np.ndarray:
     wrong = np.argwhere(~np.isfinite(array))
     if len(wrong):
         row, column = wrong[0]
-        raise InputError(f"{source}: {key} is {array[row, column]} in row {row}, column {column} (from 0)")
+        raise InputError(
+            f"{source}: {key} is {array[row, column]} in row {row}, column {column} (from 0); leave such rows out, with"
+            " their time: gaps of it are seen"
+        )
     return array
 
 

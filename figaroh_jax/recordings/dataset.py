@@ -322,7 +322,8 @@ def _columns(table: Table, source, names: Sequence[str], key: str, samples: int 
         name = source if isinstance(source, str) else source[column] if len(source) == len(names) else ", ".join(source)
         raise InputError(
             f"{table.file}: {key} ('{name}') is {values[row, column]} in row {row} (from 0), column {column},"
-            f" joint {names[column]}; {len(wrong)} such value{'s' if len(wrong) > 1 else ''} in all"
+            f" joint {names[column]}; {len(wrong)} such value{'s' if len(wrong) > 1 else ''} in all;"
+            " leave such rows out, stamps and all: gaps of the time are seen"
         )
     return values
 
