@@ -56,6 +56,12 @@ def as_written(what: object) -> Iterator[None]:
         raise InputError(f"{what}: is not what figaroh-jax writes; was it changed or damaged? ({said})") from error
 
 
+def check_list(name: str, given: Any) -> None:
+    """Refuse one thing where a list of such is expected."""
+    if not isinstance(given, Iterable):
+        raise InputError(f"{name} is one {type(given).__name__}; a list is expected, of one too: [{name[:-1]}]")
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Text that names the known word nearest to `name`, or lists all of them: `"; did you mean 'joint_3'?"`."""
     words = [str(word) for word in islice(known, _MOST_KNOWN)]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, overload
 
-from .errors import InputError
+from .errors import InputError, check_list
 from .formats.config import Preprocess, Task
 from .recordings.checks import Checked, checked_recordings
 from .recordings.posture_checks import check_pose_recordings
@@ -104,6 +104,7 @@ def diagnose(
     """
     from .recordings.poses import PoseRecording
 
+    check_list("recordings", recordings)
     postures = [one for one in recordings if isinstance(one, PoseRecording)]
     if postures:
         from .calibration.kinematic_diagnosis import diagnose_poses

@@ -142,6 +142,12 @@ def test_the_robot_of_a_task_has_its_joints_in_their_order(tmp_path):
     assert tuple(model.gravity) == (0, 0, -1.62)
 
 
+def test_the_path_of_a_robot_is_no_task(tmp_path):
+    write(tmp_path, task())
+    with pytest.raises(InputError, match="load_robot takes a task.*robot.urdf' is a path: load_urdf"):
+        load_robot(tmp_path / "robot.urdf")  # pyright: ignore[reportArgumentType]
+
+
 def test_a_free_root_is_loaded_but_refused_where_recordings_hold_joint_torques(tmp_path):
     keys = task()
     keys["robot"]["root"] = "free_flyer"

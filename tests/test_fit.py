@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -100,6 +102,7 @@ def test_limits_hold_and_a_prior_pulls(robot: fj.RobotModel, tracked: tuple[fj.P
         ("joint_offsets", "'joint_offsets' — did you mean|nothing is called 'joint_offsets'"),
         ({"joint_offset": ["knee"]}, "none at"),
         ("friction", "the model and the data have none"),
+        ({"friction": ["elbow"]}, "the model and the data have none; give the model some: extend"),
         ((), "nothing is named"),
     ],
 )
@@ -224,3 +227,11 @@ def test_plain_gradients_by_all_of_the_data_are_those_of_refits(
         sides = [fitted(eqx.tree_at(leaf, data, np.asarray(leaf(data)) + s * 1e-4 * way)) for s in (1, -1)]
         slope = (np.asarray(leaf(jax.grad(fitted)(data))) * way).sum()
         np.testing.assert_allclose(slope, (sides[0] - sides[1]) / 2e-4, rtol=1e-5, atol=0)
+
+
+def test_one_recording_where_a_list_is_expected_is_told(robot: fj.RobotModel):
+    q = np.zeros((50, robot.nv))
+    one: Any = fj.recording(q=q, tau=q, rate=100)
+    for use in (fj.diagnose, fj.identify, fj.calibrate):
+        with pytest.raises(fj.InputError, match=r"recordings is one Recording; a list is expected.*\[recording\]"):
+            use(robot, one)

@@ -135,9 +135,12 @@ def chosen_of(model: ExtendedModel, data: Sequence[Data], free: Any) -> Free:
         given = list(_parts(kind, model, data))
         chosen = given if places is True else [p for p in (_only(part, places) for part in given) if p.index]
         if not chosen:
-            what = "the model and the data have none" if places is True else f"none at {places}"
+            what = "the model and the data have none" if places is True or not given else f"none at {places}"
             known = sorted({name for part in given for name in part.names})
-            raise InputError(f"free: {kind}: {what}{'; known: ' + ', '.join(known[:12]) if known else ''}")
+            more = f"; known: {', '.join(known[:12])}" if known else ""
+            if not given and kind in ("friction", "effects"):
+                more = "; give the model some: extend(model, place(CATALOGUE[name], model, at))"
+            raise InputError(f"free: {kind}: {what}{more}")
         parts += chosen
     double = {p.kind for p in parts if p.kind == "effect" and sum(q[:2] == p[:2] for q in parts) > 1}
     if double:

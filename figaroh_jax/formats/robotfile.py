@@ -130,6 +130,11 @@ def load_robot(task: Task) -> RobotModel:
     >>> fj.load_robot(fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml"))).nv
     4
     """
+    if isinstance(task, str | Path):
+        raise InputError(
+            f"load_robot takes a task, as load_task reads it, and '{task}' is a path: load_urdf, load_mjcf or load_usd"
+            " reads the file of a robot"
+        )
     try:
         model_format(task.robot.model)
     except InputError as error:

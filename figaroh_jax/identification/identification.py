@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from ..effects.base import Effect
 from ..effects.friction import CoulombFriction
 from ..effects.plausibility import implausible
-from ..errors import InputError, nearest
+from ..errors import InputError, check_list, nearest
 from ..estimation.base_parameters import BaseParameters, base_parameters, essential
 from ..estimation.columns import friction_terms, structural_columns
 from ..estimation.conic import Body, NotConverged
@@ -178,6 +178,7 @@ def identify(
     """
     from ..formats.config import Baseline, Preprocess
 
+    check_list("recordings", recordings)
     backend = as_backend(model)
     model = backend.robot
     warned = check_recordings(None, model, recordings) if check else ()
