@@ -347,6 +347,22 @@ def test_decimal_commas_iso_times_empty_cells_and_words(tmp_path: Path):
         table.read("state")
 
 
+@pytest.mark.parametrize("between", [";", "\t", "|", " ", ","])
+def test_decimal_commas_between_any_delimiters(tmp_path: Path, between: str):
+    file = tmp_path / "run.txt"
+    numbers = np.arange(150).reshape(50, 3) / 8 - 2
+    rows = [[f"{x:.4f}".replace(".", ",") for x in row] for row in numbers]
+    rows = [[f'"{cell}"' for cell in row] if between == "," else row for row in rows]
+    file.write_text("\n".join(between.join(row) for row in [["t", "q1", "q2"], *rows]) + "\n")
+    table = read_table(file, "data")
+    np.testing.assert_array_equal(np.stack([table.read(name) for name in ("t", "q1", "q2")], 1), numbers)
+
+
+def test_a_delimiter_in_words_is_none(tmp_path: Path):
+    (tmp_path / "run.csv").write_text("t,q1,state\n" + "".join(f"{k},{k}.5,on|off\n" for k in range(50)))
+    np.testing.assert_array_equal(read_table(tmp_path / "run.csv", "data").read("q1"), np.arange(50) + 0.5)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -178,13 +178,12 @@ def _refuse_unmeasured(robot: RobotModel, recordings: Sequence[Recording]) -> No
         dead = np.flatnonzero(np.ptp(one.torque, axis=0) == 0)
         if 0 < dead.size < one.torque.shape[1]:  # of all joints: `check_recordings` says so
             j = int(dead[0])
-            still = (
-                f"; it stands still: name the other joints in robot.joints, and {robot.dof_names[j]} in robot.posture"
-            )
-            moves = "; identify leaves such a joint out, a diagnosis judges every joint by its torque"
+            name, still = robot.dof_names[j], np.ptp(one.position[:, j]) == 0
+            instead = "identify leaves such a joint out, a diagnosis judges every joint by its torque"
+            if still:
+                instead = f"it stands still: name the others in robot.joints, and {name} in robot.posture"
             raise InputError(
-                f"{one.file}: the torque of {robot.dof_names[j]} is {one.torque[0, j]:g} in every row: it was not"
-                f" measured{still if np.ptp(one.position[:, j]) == 0 else moves}"
+                f"{one.file}: the torque of {name} is {one.torque[0, j]:g} in every row: it was not measured; {instead}"
             )
 
 

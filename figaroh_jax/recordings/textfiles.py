@@ -28,6 +28,7 @@ _DELIMITERS = (",", ";", "\t", "|", None)  # None: white space
 _BLOCK = 1 << 23  # bytes read at once
 _LEAD = 60  # lines above the numbers, at most
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+([eE][+-]?\d+)?\s*")
+_WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
 _NOT_NUMBERS = ("", "na", "n/a", "null", "none", "-")
 
 
@@ -64,7 +65,7 @@ def _layout(file: Path) -> _Layout:
     lines = _first_lines(file)
     delimiter = _delimiter(lines)
     rows = [_cells(line, delimiter) for line in lines]
-    decimal = "." if delimiter == "," else _decimal(rows)
+    decimal = _decimal(rows)
     first = next((k for k, row in enumerate(rows) if _is_data(row, decimal)), None)
     if first is None:
         if len(lines) < 2:
@@ -115,8 +116,14 @@ def _delimiter(lines: Sequence[str]) -> str | None:
         same = sum(count == counts[-1] for count in counts) if counts else 0
         if counts and counts[-1] > 1 and same >= 0.5 * len(counts) and (same, counts[-1]) > best:
             best, delimiter = (same, counts[-1]), one
-    comma_decimals = delimiter == "," and any(";" in line for line in tail)
-    return ";" if comma_decimals and len({line.count(";") for line in tail}) == 1 else delimiter
+    if delimiter != ",":
+        return delimiter
+    for one in (";", "\t", "|") if tail else ():  # the commas may be those of the numbers
+        cells, even = _cells(tail[-1], one), len({line.count(one) for line in tail}) == 1
+        if even and len(cells) > 1 and any(map(_DECIMAL_COMMA.fullmatch, cells)):
+            return one
+    cells = tail[-1].split() if tail else []
+    return None if len(cells) > 1 and all(map(_WITH_COMMA.fullmatch, cells)) else ","
 
 
 def _decimal(rows: Sequence[Sequence[str]]) -> str:
@@ -190,6 +197,8 @@ def _without_repeats(
 
 def _fast(block: str, layout: _Layout) -> np.ndarray | None:
     """Rows of a block whose every cell is a number; None where one is not."""
+    if layout.delimiter == layout.decimal:  # commas of quoted numbers are not those between them
+        return None
     text = block.replace(",", ".") if layout.decimal == "," else block
     try:
         found = np.loadtxt(io.StringIO(text), delimiter=layout.delimiter, ndmin=2, quotechar='"', comments=None)
