@@ -215,7 +215,7 @@ def test_a_payload_that_rests_on_known_gains_says_so(tmp_path: Path):
     assert main(["diagnose", str(path), "--out", str(tmp_path / "run"), "--quiet"]) == 0
     answer = json.loads((tmp_path / "run" / "answer.json").read_text())
     assert [one["effect"] for one in answer["causes"]] == ["payload"]
-    assert any("payload at link: the drives' gains are taken as right" in note for note in answer["notes"])
+    assert any("payload (link): the drives' gains are taken as right" in note for note in answer["notes"])
 
 
 def test_identify_says_that_free_gains_are_not_fitted_unless_named(tmp_path: Path):

@@ -200,6 +200,8 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
     refitted = _refitted(here, found if named else None, last)
     creeps = creep_notes(here, found) if named else {}
     told = creeps | body_notes(here, found) if named else {}
+    for name, text in (_taken_gains(task, found) if named else {}).items():
+        told[name] = "; ".join([*filter(None, [told.get(name)]), text])
     diagnosis = Diagnosis(
         verdict=_verdict(found),
         causes=(*_faulty(found, here), *(_cause(one, found, here, told) for one in (found.named if named else ()))),
@@ -224,7 +226,6 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
             *(f"{name}: {text}" for name, text in told.items()),
             *(_open_sizes(found) if named else ()),
             *(one_number_notes(found) if named else ()),
-            *(_taken_gains(task, found) if named else ()),
             *implausible(loop.robot, model, task.robot.trust),
             *_spring_note(final),
             *_refitted_note(here, runs, refitted, found.verdict),
@@ -487,16 +488,17 @@ def one_number_notes(found: Search) -> list[str]:
     ]
 
 
-def _taken_gains(task: Task, found: Search) -> list[str]:
+def _taken_gains(task: Task, found: Search) -> dict[Name, str]:
     """That a payload was told from a drive's gain by taking the gains for right."""
     if task.actuator.gains == "free":
-        return []
-    return [
-        f"payload at {one.candidate.at[0]}: the drives' gains are taken as right (actuator.gains: known); a"
-        " gain that is off may look the same, and gains: free tells both"
+        return {}
+    text = "the drives' gains are taken as right (actuator.gains: known); a gain that is off may look the same, and"
+    rest = "; a misfit stays, so try that before you believe this" if found.verdict == "named+rest" else ""
+    return {
+        Name(one.candidate.effect, one.candidate.at): f"{text} gains: free tells both{rest}"
         for one in found.named
         if one.candidate.effect == "payload"
-    ]
+    }
 
 
 def _experiment(found: Search) -> Experiment | None:
