@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -343,3 +344,22 @@ def test_frames_that_are_swapped_are_one_message_before_any_work(wrong: tuple[Pa
     (tmp_path / "task.yaml").write_text(yaml.safe_dump(keys))
     with pytest.raises(fj.InputError, match=r"task\.yaml: data\[0\]\.measurement: .*; are the two swapped\?"):
         calibrate_task(load_task(tmp_path / "task.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("offset", "count", "said"),
+    [
+        ([0, 0.006, -0.009, 0.004, 0.012, 0], 8, "predicts surely better than .* which these postures are too few"),
+        ([0, 0.002, -0.002, 0, 0, 0], 60, "no error of its kinematics that is surely beyond the tolerance .p = 0"),
+        ([0, 0, 0, 0, 0, 0], 40, "no error of its kinematics beyond the tolerance. No correction .* predicts better"),
+    ],
+)
+def test_what_is_not_sure_is_not_said_to_be_absent(tmp_path: Path, capsys: Any, offset: list, count: int, said: str):
+    rng = np.random.default_rng(5)
+    real = poses.truth(rng, markers=1, offset=np.array(offset))
+    (tmp_path / "robot.urdf").write_text(poses.urdf())
+    q = poses.postures(rng, count)
+    points = poses.points(poses.tool_poses(tmp_path / "robot.urdf", q, real), real, rng, noise=3e-5)
+    task = write(tmp_path, q, points[:, 0] if points.ndim == 3 else points)
+    assert cli.main(["diagnose", str(task), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    assert re.search(said, " ".join(capsys.readouterr().out.split()))

@@ -209,11 +209,18 @@ def _gained(calibration: Calibration) -> str:
     effects = any(c.name.effect not in ("joint_offset", "outlier") for c in calibration.causes)
     found = level(calibration.level)
     if calibration.level == "frames":
+        channel, scale = (0, 1e3) if calibration.position is error else (1, 180.0 / math.pi)
+        best = min(calibration.table, key=lambda name: calibration.table[name][channel])
+        size = scale * calibration.table[best][channel]
+        unsure = size < 0.5 * error.validated_after
         nominal = (
-            "No correction of the robot predicts better than the nominal kinematics with base and tool frames fitted"
+            f"No correction of the robot predicts {'surely ' if unsure else ''}better than the nominal kinematics with"
+            " base and tool frames fitted"
         )
         if not effects:
-            return f"{nominal}: {after} on held-out postures."
+            seems = _with_unit(number(size, 3), error.unit)
+            more = f"; {level(best)} would leave {seems}, which these postures are too few to bear out"
+            return f"{nominal}: {after} on held-out postures{more if unsure else ''}."
         found = "the nominal geometry and what is named"
     told = f"the error on held-out postures falls from {before} (base and tool frames only) to {after}"
     if not error.validated_after < error.validated_before:
@@ -225,7 +232,10 @@ def pose_sentence(diagnosis: PoseDiagnosis, robot: str) -> str:
     """The verdict on measured postures in one sentence."""
     subject = f"The postures of {robot} show"
     if diagnosis.verdict == "nothing":
-        return f"{subject} no error of its kinematics beyond the tolerance."
+        if diagnosis.calibration.level == "frames":
+            return f"{subject} no error of its kinematics beyond the tolerance."
+        doubt = f"surely beyond the tolerance ({p_value(diagnosis.p_value)})"
+        return f"{subject} no error of its kinematics that is {doubt}; `calibrate` corrects what there is."
     if diagnosis.verdict == "unknown":
         return f"{subject} an error that no effect in the catalogue explains."
     rest = "; part of the error remains unexplained" if diagnosis.verdict == "named+rest" else ""
