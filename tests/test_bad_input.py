@@ -237,6 +237,10 @@ MODELS: dict[str, tuple[Spoil, list[str]]] = {
     "empty": (model(""), ["robot.urdf", "empty"]),
     "not XML": (model("robot: arm"), ["robot.urdf", "XML"]),
     "cut short": (model(URDF[:900]), ["robot.urdf", "XML"]),
+    "xacro": (
+        model(URDF.replace('"bench">', '"bench" xmlns:xacro="http://ros.org/wiki/xacro"><xacro:include file="a"/>')),
+        ["robot.urdf", "line 1", "<xacro:include>", "xacro robot.urdf > expanded.urdf"],
+    ),
     "another XML": (model("<svg/>"), ["robot.urdf", "<svg>", "<robot>"]),
     "billion laughs": (model(LAUGHS_XML), ["robot.urdf"]),
     "two roots": (urdf("</robot>", SECOND_ROOT), ["stray", "root"]),

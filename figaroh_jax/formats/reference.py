@@ -93,7 +93,7 @@ KEYS: dict[str, tuple[str, str, str]] = {
     "diagnose.tolerance.torque": ("1, of the RMS", "0.02", "a misfit below 1 % of a joint's torque is `nothing`"),
     "diagnose.tolerance.offset": ("rad", "0.002", "offsets below 1 mrad are `nothing`"),
     "diagnose.tolerance.geometry": ("m", "0.001", "errors of geometry below 0.5 mm are `nothing`"),
-    "diagnose.tolerance.position": ("rad", "0.002", "rollouts that stay within 1 mrad are `nothing`"),
+    "diagnose.tolerance.position": ("rad", "0.002", "stated: rollouts that stay within it are `nothing`"),
     "identify.fit": ("", "unconstrained", "links are physically consistent, by a conic solver"),
     "identify.joints": ("", "[elbow]", "the torque of every joint is fitted that moves"),
     "identify.bounds.<link>.mass": ("kg", "[1.0, 3.0]", "the mass is bounded by consistency alone"),

@@ -5,6 +5,7 @@ Only what moves and weighs is read: links with their inertias, joints with place
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -35,6 +36,7 @@ _UNREAD = {  # by the element that holds them
     "link": ("visual", "collision"),
     "joint": ("dynamics", "calibration", "safety_controller"),
 }
+_XACRO = re.compile(r"\{[^}]*\bxacro/?\}")  # the namespace of what the program xacro replaces
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _ROWS = ("ixx ixy ixz", "ixy iyy iyz", "ixz iyz izz")
 _NUMBERS = {  # element: attributes, how many numbers each holds, which must be there
@@ -131,6 +133,11 @@ def said_twice(path: str | Path) -> tuple[str, ...]:
 def _read(path: str | Path) -> Any:
     """Root element of a file of which every name and number that is read has been checked."""
     root = read_xml(path, "robot")
+    if (left := next((one for one in root.iter("*") if _XACRO.match(one.tag)), None)) is not None:
+        raise InputError(
+            f"{path}: line {left.sourceline} holds <xacro:{_XACRO.sub('', left.tag)}>: this is the source of a URDF;"
+            f" write the URDF by `xacro {Path(path).name} > expanded.urdf`"
+        )
     refuse_many(str(path), "links", sum(1 for _ in root.iterchildren("link")))
     for part in [part for holder, tags in _UNREAD.items() for tag in tags for part in root.findall(f"{holder}/{tag}")]:
         part.getparent().remove(part)
