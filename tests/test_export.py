@@ -13,6 +13,7 @@ import pytest
 import robots
 import yaml
 
+import figaroh_jax as fj
 from figaroh_jax.effects.base import Effect, Motion, amplitude, place
 from figaroh_jax.effects.catalogue import CATALOGUE, find, register
 from figaroh_jax.effects.extended import ExtendedModel, extend, predict
@@ -362,3 +363,14 @@ def test_mujoco_and_our_simulation_stay_together(model: RobotModel, tmp_path: Pa
     coarse, fine = apart(5e-4), apart(2.5e-4)
     assert fine < 2e-3
     assert coarse / fine == pytest.approx(2.0, rel=0.2)
+
+
+def test_a_users_file_is_not_replaced(tmp_path: Path):
+    model = load_urdf(fj.DEMO)
+    own = tmp_path / "robot.urdf"
+    own.write_text("mine")
+    with pytest.raises(InputError, match=r"robot\.urdf is there and is none that write_model wrote"):
+        write_model(model, tmp_path)
+    assert own.read_text() == "mine" and list(tmp_path.iterdir()) == [own]
+    write_model(model, tmp_path / "new")
+    write_model(extend(model), tmp_path / "new")  # what it has written it may write anew

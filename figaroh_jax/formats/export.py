@@ -32,6 +32,8 @@ from .urdf_text import urdf_text
 
 __all__ = ["dump_yaml", "load_model", "model_files", "write_model"]
 
+_HEAD = "# The extended model: the robot before its effects, and every effect. Read by figaroh-jax.\n"
+
 _GEOMETRY = ("placement", "axis", "ratio", "offset", "frame_placement")
 
 
@@ -51,22 +53,30 @@ def dump_yaml(content: Mapping[str, Any], *, line: bool = False) -> str:
     return yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, width=width, default_flow_style=flow)
 
 
-def write_model(extended: ExtendedModel, directory: str | Path, causes: Sequence[Cause] = ()) -> None:
+def write_model(model: ExtendedModel | RobotModel, directory: str | Path, causes: Sequence[Cause] = ()) -> None:
     """Write `robot.urdf`, `robot.xml` and `effects.yaml` into `directory`, which is made where it is missing.
+
+    Files of these names that it has not written are not replaced: `InputError`.
 
     `causes` give the standard deviations of the effects that they name; those of the others are null. What a format
     cannot carry stands in `effects.yaml`, at the effect and under `warnings`.
 
     >>> import tempfile, figaroh_jax as fj
-    >>> model = fj.extend(fj.load_urdf(fj.DEMO))
+    >>> model = fj.load_urdf(fj.DEMO)
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     fj.write_model(model, folder)
     ...     fj.load_model(folder).robot.nv
     4
     """
     directory = Path(directory)
-    texts = model_files(extended, causes)
+    texts = model_files(extend(model) if isinstance(model, RobotModel) else model, causes)
     directory.mkdir(parents=True, exist_ok=True)
+    head = directory / "effects.yaml"
+    if not (head.is_file() and head.read_bytes().startswith(_HEAD.encode())):
+        for name, text in texts.items():
+            file = directory / name
+            if file.exists() and not (file.is_file() and file.read_bytes() == text.encode()):
+                raise InputError(f"{file} is there and is none that write_model wrote; name another folder")
     for name, text in texts.items():
         (directory / name).write_text(text, encoding="utf-8")
 
@@ -88,10 +98,9 @@ def _files(extended: ExtendedModel, robot: RobotModel, causes: Sequence[Cause]) 
     ]
     content = _robot(extended, robot) | {"effects": effects}
     warnings = {"warnings": [*urdf_warnings, *mjcf_warnings, *_warnings(extended, in_urdf, in_mjcf)]}
-    head = "# The extended model: the robot before its effects, and every effect. Read by figaroh-jax.\n"
     text = dump_yaml(content)
     text += yaml.dump(warnings, Dumper=_Dumper, width=120, default_flow_style=False)
-    return {"robot.urdf": urdf, "robot.xml": mjcf, "effects.yaml": head + text}
+    return {"robot.urdf": urdf, "robot.xml": mjcf, "effects.yaml": _HEAD + text}
 
 
 def _robot(extended: ExtendedModel, changed: RobotModel) -> dict[str, Any]:
