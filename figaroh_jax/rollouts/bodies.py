@@ -30,8 +30,18 @@ from .screening import Standing, excess_of
 from .search import TOO_LITTLE, Model, Named, Search, t_of, t_of_recordings
 from .sensitivity import Windows
 from .setting import Setting, Structure, by_recording, excess, free_entries, thinned, whitened
+from .sizes import told_errors
 from .steady import most_unsteady
-from .thresholds import BODY, GAIN, GAIN_BESIDE_REST, MOST_OF_A_REST, STEADY_OF_A_LINK, T_BESIDE_REST, T_WITHOUT_REST
+from .thresholds import (
+    BODY,
+    CLEAR_OF_NOTHING,
+    GAIN,
+    GAIN_BESIDE_REST,
+    MOST_OF_A_REST,
+    STEADY_OF_A_LINK,
+    T_BESIDE_REST,
+    T_WITHOUT_REST,
+)
 
 __all__ = [
     "EFFECT",
@@ -497,6 +507,9 @@ def _better(
         if after.excess.max() >= 1.0 and share > STEADY_OF_A_LINK:
             why = f"its size differs by {by} ({share:.2g} of what it explains), as that of what stands in for another"
             return replace(found, doubtful=[*found.doubtful, (Name(EFFECT, at), gain, why)])
+        if after.excess.max() >= 1.0 and not _has_a_number(structure, last, other.spread, link):
+            why = "none of its numbers is surely there: together they may follow what else is missing"
+            return replace(found, doubtful=[*found.doubtful, (Name(EFFECT, at), gain, why)])
         named.append(Named(one, t, gain, (), *sizes))
     label = ", ".join(str(Name(n.candidate.effect, n.candidate.at)) for n in named)
     first = found.first.theta
@@ -514,6 +527,13 @@ def _better(
         held=[found.held[0], *other.held],
         setting=replace(sound, loop=filed),
     )
+
+
+def _has_a_number(structure: Structure, last: Fit, spread: np.ndarray | None, link: Link) -> bool:
+    """Whether one of the link's numbers alone is told from zero, by what is left and by how recordings differ."""
+    errors = told_errors(structure, last, spread)
+    at = [int(np.flatnonzero(last.free == entry)[0]) for entry in link.entries if entry in last.free]
+    return bool((np.abs(last.theta[last.free[at]]) > CLEAR_OF_NOTHING * errors[at]).any())
 
 
 def _stands(here: Setting, structure: Structure, last: Fit) -> Standing:
