@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -95,6 +96,7 @@ def diagnose_rollout_task(
         found = searched_with_bodies(seek, here, found, progress, forbid=task.diagnose.forbid)
         if not np.isfinite(found.first.cost):
             raise InputError(f"{task.robot.model}: {diverged(here, found.first)}")
+        found = _with_gains_free(task, loop, runs, seek, found, progress)
         progress("measuring the gain", 0.9)
         here = found.setting or here
         notes = (*notes, *(one.text(loop, here.runs) for one in found.faults))
@@ -486,6 +488,33 @@ def one_number_notes(found: Search) -> list[str]:
         for (effect, _), at in together.items()
         if len(at) > 1
     ]
+
+
+def _with_gains_free(
+    task: Task,
+    loop: Loop,
+    runs: Sequence[Run],
+    seek: Callable[..., Search],
+    found: Search,
+    progress: Callable[[str, float], None],
+) -> Search:
+    """What was found; no names where a load stands beside a rest, and gains not taken as right leave noise alone.
+
+    A load and a gain look alike to the joint that carries it; what the load does at the others is the rest.
+    """
+    loaded = any(one.candidate.effect in ("payload", "link_inertia") for one in found.named)
+    asked = found.verdict == "named+rest" and loaded and task.actuator.gains == "known"
+    if not asked or "actuator_gain" in task.diagnose.forbid:
+        return found
+    progress("asking whether the drives' gains are right", 0.9)
+    free = task.model_copy(update={"actuator": task.actuator.model_copy(update={"gains": "free"})})
+    other = seek(diagnosis_setting(free, loop, runs), progress, forbid=task.diagnose.forbid)
+    gains = [str(Name("actuator_gain", n.candidate.at)) for n in other.named if n.candidate.effect == "actuator_gain"]
+    if other.verdict != "named" or not gains:
+        return found
+    why = f"{' and '.join(gains)} in its place leaves noise alone: set actuator.gains: free, or correct the gain"
+    told = [(Name(n.candidate.effect, n.candidate.at), n.gain, why) for n in found.named]
+    return replace(found, verdict="unknown", named=[], doubtful=[*told, *found.doubtful])
 
 
 def _taken_gains(task: Task, found: Search) -> dict[Name, str]:
