@@ -281,6 +281,7 @@ def drawn(
             return None
         place = rng.uniform(-1, 1, 3) * 0.3 * travel[j]
         lever = 9.81 * np.linalg.norm(place) + 4.0 * travel[j] * (place @ place)
+        lever = 9.81 + 4.0 * travel[j] if robot.slides[j] else lever
         at, carried = held[0], (j, 1.5 * size * load[j] / lever, place)
     if effect == "torque_delay":
         at = ""
