@@ -63,7 +63,7 @@ def test_a_start_from_rest_is_not_lost_in_the_noise_of_all_the_rest(rate: float,
     begun = 10 * grow**3 - 15 * grow**4 + 6 * grow**5
     slope = 30 * grow**2 - 60 * grow**3 + 30 * grow**4
     bend = 60 * grow - 180 * grow**2 + 120 * grow**3
-    for _ in range(7):
+    for _ in range(15):
         wave, size = 2 * np.pi * rng.uniform(0.06, 0.9, 3), np.array([0.6, 0.3, 0.12])
         angle = wave * time[:, None] + rng.uniform(0, 6, 3)
         s, c = np.sin(angle), np.cos(angle)
@@ -73,7 +73,7 @@ def test_a_start_from_rest_is_not_lost_in_the_noise_of_all_the_rest(rate: float,
             found = np.gradient(np.gradient(smoothed(read, 1 / rate, band), 1 / rate), 1 / rate)
             off.append(np.std((found - true)[3:-3]))
         times.append(off[0] / min(off))
-    assert np.median(times) < 1.8, (seed, times)  # 3 to 15 where the spectrum of the whole alone is asked
+    assert np.median(times) < 2.6, (seed, times)  # 3 to 15 where the spectrum of the whole alone is asked
 
 
 def test_a_motion_that_is_faster_than_the_noise_keeps_its_cutoff() -> None:

@@ -32,6 +32,7 @@ FELT = 0.1  # of the noise's power: steps of less are lost in it
 FEW_VALUES = 20  # of a position: fewer are steps
 LINE = 3  # bins to either side to which the window spreads a line
 AT_ONCE = 64  # stretches, for the memory that they take
+TOLD = 0.05  # of the power, that smoothing must take off for what it takes to be told
 READINGS = 4  # of a motion by an encoder, each with its steps at another place
 STRETCH = 1.0  # s in which a motion that is short may show, and no less than 20 periods of the cutoff
 
@@ -47,7 +48,11 @@ def note_on(band: Band) -> tuple[str, ...]:
 
 
 def motion_band(
-    position: Float[np.ndarray, " samples"], dt: float, cutoff: float, step: float = 0.0, rate: float | None = None
+    position: Float[np.ndarray, " samples"],
+    dt: float,
+    cutoff: float,
+    step: float = 0.0,
+    rate: float | None = None,
 ) -> float:
     """Frequency (Hz, at most `cutoff`) up to which a position (rad or m, every `dt` s) holds more motion than noise.
 
@@ -71,11 +76,15 @@ def motion_band(
         steps = _stepping(position, dt, cutoff, step, rate or 1 / dt, frequency, power)
         noise = np.maximum(noise, _line_by_line(steps, 1 / (rate or 1 / dt), dt, frequency)[low])
     weight, motion = frequency[low] ** 4, np.where(power[low] > CHANCE * noise, power[low] - noise, 0.0)
-    motion = np.maximum(motion, _in_stretches(position, dt, cutoff, frequency[low], noise, steps, rate or 1 / dt))
     gain = 1 / (1 + (frequency[low] / (cutoff * STEPS[:, None])) ** (2 * ORDER))
     error = ((1 - gain) ** 2 * motion + gain**2 * noise) @ weight
     best = int(np.argmin(error))
-    return float(cutoff * STEPS[best]) if error[best] < WORTH * error[0] else cutoff
+    if error[best] >= WORTH * error[0]:
+        return cutoff
+    left = position - smoothed(position, dt, cutoff * STEPS[best])
+    short = _in_stretches(left, dt, cutoff, (1 - gain[best]) ** 2, frequency[low], noise, steps, rate or 1 / dt)
+    error = ((1 - gain) ** 2 * np.maximum(motion, short) + gain**2 * noise) @ weight
+    return float(cutoff * STEPS[max(int(np.argmin(error)), 1)])
 
 
 def encoder_step(position: Float[np.ndarray, " samples"]) -> float:
@@ -134,25 +143,29 @@ def _line_by_line(
 
 
 def _in_stretches(
-    position: np.ndarray,
+    left: np.ndarray,
     dt: float,
     cutoff: float,
+    taken: np.ndarray,
     frequency: np.ndarray,
     noise: np.ndarray,
     steps: np.ndarray | None,
     rate: float,
 ) -> Float[np.ndarray, " freqs"]:
-    """Power of the motion that shows above the `noise` in stretches of `STRETCH`, each begun a quarter further on.
+    """Power of the motion that shows in what smoothing has `left` of a position, in stretches of `STRETCH`, each begun
+    a quarter further on: more than the `noise`, of both of which smoothing leaves the share that it has `taken` off.
 
-    `steps` are errors of readings at `rate` (Hz), of which each stretch has its own.
+    Slow motion is gone from it, which would spread to all frequencies of a stretch. `steps` are errors of readings at
+    `rate` (Hz), of which each stretch has its own.
     """
-    second, samples = np.diff(position, 2), round(max(STRETCH, 20.0 / cutoff) / dt)
+    second, samples = np.diff(left, 2), round(max(STRETCH, 20.0 / cutoff) / dt)
     if len(second) <= samples:
         return np.zeros_like(noise)
     begins = np.append(np.arange(0, len(second) - samples, max(samples // 4, 1)), len(second) - samples)
     window, own = np.kaiser(samples, WINDOW), np.fft.rfftfreq(samples, dt)
     share = np.append(np.inf, (2 * np.sin(np.pi * own[1:] * dt)) ** 4) * (window**2).sum()
     white, above = np.interp(own, frequency, noise), np.zeros_like(own)
+    part = np.interp(own, frequency, taken)
     parts = np.lib.stride_tricks.sliding_window_view(second, samples)
     for some in np.array_split(begins, math.ceil(len(begins) / AT_ONCE)):
         power, usual = np.abs(np.fft.rfft(parts[some] * window)) ** 2 / share, white
@@ -161,8 +174,8 @@ def _in_stretches(
             at = np.minimum(np.round(some * dt * rate).astype(int), steps.shape[1] - read)
             local = np.lib.stride_tricks.sliding_window_view(steps, read, axis=1)[:, at]
             usual = np.maximum(white, _line_by_line(local, 1 / rate, dt, own))
-        above += np.where(power > CHANCE * usual, power - usual, 0.0).sum(0) / len(begins)
-    return np.interp(frequency, own, above)
+        above += np.where(power > CHANCE * part * usual, power - part * usual, 0.0).sum(0) / len(begins)
+    return np.interp(frequency, own, np.where(part > TOLD, above / np.maximum(part, TOLD), 0.0))
 
 
 def smoothed(position: Float[np.ndarray, " samples"], dt: float, band: float) -> Float[np.ndarray, " samples"]:
