@@ -138,6 +138,42 @@ def test_the_command_writes_a_draft_and_replaces_nothing(made, tmp_path: Path, c
     assert "exists already" in capsys.readouterr().err
 
 
+def test_a_draft_says_that_constant_torques_and_gains_are_no_finding(made, tmp_path: Path):
+    """A baseline with an offset takes it in without a word, and `gains: known` a gain that is off."""
+    urdf, _, (run, *_) = made
+    np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"], tau=run["torque"], cmd=run["position"])
+    draft = draft_task(urdf, [tmp_path / "run.npz"])
+    assert yaml.safe_load(draft.text)["baseline"]["offset"] is True
+    said = next(line for line in draft.assumed if "constant torque" in line)
+    assert "`offset: false`" in said and said in draft.text
+    np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"], cmd=run["position"])
+    draft = draft_task(urdf, [tmp_path / "run.npz"], gains=[9.0, 8.0, 7.0])
+    assert any("actuator.gains: known" in line for line in draft.assumed)
+    assert not any("constant torque" in line for line in draft.assumed)
+
+
+def test_a_draft_names_files_of_its_folder_from_there_and_letters_as_they_are(made, tmp_path: Path, capsys):
+    """The folder can move, and a name in any script can be read."""
+    urdf, _, (run, *_) = made
+    home, away = tmp_path / "messung", tmp_path / "anderswo"
+    (home / "daten").mkdir(parents=True)
+    (home / "robot é.urdf").write_text(urdf.read_text())
+    for file in (home / "daten" / "schulter λ.npz", away.with_suffix(".npz")):
+        np.savez(file, t=run["time"], q=run["position"], tau=run["torque"])
+    files = [home / "robot é.urdf", home / "daten" / "schulter λ.npz", away.with_suffix(".npz")]
+    assert cli.main(["new", *map(str, files), "--out", str(home / "task.yaml")]) == 0
+    text = (home / "task.yaml").read_text(encoding="utf-8")
+    keys = yaml.safe_load(text)
+    assert keys["robot"]["model"] == "robot é.urdf" in text and "daten/schulter λ.npz" in text
+    assert [entry["file"] for entry in keys["data"]] == ["daten/schulter λ.npz", str(away.with_suffix(".npz"))]
+    home.rename(away)
+    task = load_task(away / "task.yaml")
+    assert len(read_recordings(task, load_robot(task))) == 2
+    capsys.readouterr()
+    assert cli.main(["new", *map(str, (urdf, files[-1]))]) == 0  # printed, it may be put anywhere
+    assert yaml.safe_load(capsys.readouterr().out)["robot"]["model"] == str(urdf)
+
+
 def test_a_plain_list_of_constants_is_a_diagonal(made, tmp_path: Path):
     urdf, _, (run, *_) = made
     np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"], current=run["torque"] / [2.0, 4.0, 5.0])

@@ -50,7 +50,9 @@ _Dumper.add_representer(np.ndarray, lambda dumper, array: dumper.represent_list(
 def dump_yaml(content: Mapping[str, Any], *, line: bool = False) -> str:
     """The mapping as YAML, in its order, numbers in full and lists of numbers on one line, or all of it (`line`)."""
     width, flow = (float("inf"), True) if line else (120, None)
-    return yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, width=width, default_flow_style=flow)
+    return yaml.dump(
+        dict(content), Dumper=_Dumper, sort_keys=False, width=width, default_flow_style=flow, allow_unicode=True
+    )
 
 
 def write_model(model: ExtendedModel | RobotModel, directory: str | Path, causes: Sequence[Cause] = ()) -> None:

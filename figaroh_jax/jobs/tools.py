@@ -36,8 +36,8 @@ def new(args: argparse.Namespace) -> int:
             raise InputError(f"--rate {args.rate}: expected a positive number of Hz")
         constants, gains = _numbers(args.constants, "--constants"), _numbers(args.kp, "--kp")
         known = {"rate": args.rate, "unit": args.unit, "topic": args.topic, "constants": constants, "gains": gains}
-        gears = _numbers(args.gears, "--gears")
-        return draft_task(args.model, args.recordings, joints=joints, gears=gears, drives=drives, **known)
+        known |= {"gears": _numbers(args.gears, "--gears"), "folder": args.out and args.out.parent}
+        return draft_task(args.model, args.recordings, joints=joints, drives=drives, **known)
 
     def drives(joints: Sequence[str]) -> tuple[Driven, ...]:
         from ..rollouts.reading import driven_joints, load_loop

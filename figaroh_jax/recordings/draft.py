@@ -20,6 +20,7 @@ from ..rigid.model import DOF_NAMES, RobotModel, prismatic
 from .checks import DEGREE, Finding, check_recording, position_findings
 from .dataset import Driven, Recording
 from .draft_columns import Columns, Undecided, read_columns, without_sign
+from .draft_text import baseline_said, clock_said, locked_said, task_text, unit_said
 from .likeness import FEWEST, Sampled, likeness, rigid_torque, sampled
 from .torque_checks import TURNED_POSITION
 
@@ -48,13 +49,14 @@ def draft_task(
     gains: Sequence[float] | None = None,
     gears: Sequence[float] | None = None,
     drives: Callable[[Sequence[str]], Sequence[Driven]] = lambda joints: (),
+    folder: Path | None = None,
 ) -> Draft:
     """A task for `diagnose` and `identify` on these recordings; `joints` names their columns, `rate` (Hz) their clock.
 
     `constants` are N m a unit of each torque column, `gears` motor turns a joint turn where positions are those of
     motors, `gains` the proportional gains of the position servos (N m/rad), all in the order of the joints; `unit`
     (rad, deg, m, mm) is that of the positions, `topic` that of bags. `drives` tells the drives in the model's file of
-    the joints that move; `gains` replace them.
+    the joints that move; `gains` replace them. `folder` is where the task will lie: files in it are named from there.
 
     Raises `InputError` for what cannot be read, and `Undecided` for what the data do not decide.
     """
@@ -74,7 +76,7 @@ def draft_task(
             f"{model}: joint{'s' * (len(many) > 1)} {', '.join(many)} of several degrees of freedom: `new` drafts for"
             " joints of one; lock them (--joints names the others), or write the task by hand"
         )
-    assumed = [*dict.fromkeys(_clock_said(reads))]
+    assumed = [*dict.fromkeys(clock_said(reads))]
     _doubt_percent(reads, unit)
     for option, given in (("--constants", constants), ("--gears", gears)):
         _check_factors(option, given, robot)
@@ -91,9 +93,10 @@ def draft_task(
     said += more
     said += _refuse_what_is_wrong(robot, reads, signs, stated=constants is not None)
     labels = _repeats(reads)
-    assumed += [*_locked_said(robot, whole), *motors, _unit_said(unit, robot, reads, stated)]
-    assumed += [*said, *_repeats_said(reads, labels)]
-    text = _text(model, robot, whole, reads, unit, signs, labels, assumed, actuator, gears, joints is not None)
+    assumed += [*locked_said(robot, whole), *motors, unit_said(unit, robot, reads, stated)]
+    assumed += [*said, *_repeats_said(reads, labels), baseline_said(reads)]
+    listed = joints is not None
+    text = task_text(model, robot, whole, reads, unit, signs, labels, assumed, actuator, gears, listed, folder)
     return Draft(text, tuple(assumed))
 
 
@@ -524,120 +527,3 @@ def _order_of_motors(robot: RobotModel, reads: Sequence[Columns]) -> None:
         motions += [] if motion is None else [motion]
     if motions:
         _order(robot, reads, motions, at, "command")
-
-
-# Words
-
-
-def _clock_said(reads: Sequence[Columns]) -> Iterator[str]:
-    for read in reads:
-        rate = (len(read.time) - 1) / (read.time[-1] - read.time[0])
-        unit = read.entry.get("units", {}).get("time", "s")
-        yield f"{read.file.name}: {rate:.5g} Hz, stamps in {unit}, {read.time[-1]:.4g} s"
-
-
-def _locked_said(robot: RobotModel, whole: RobotModel) -> list[str]:
-    """The joints that no column holds, and where the task has them stand."""
-    names = [name for name in whole.joint_names if name not in robot.joint_names]
-    said = "no column holds {}: locked at the neutral position; robot.posture names another one"
-    return [said.format(", ".join(names))] if names else []
-
-
-def _unit_said(unit: str, robot: RobotModel, reads: Sequence[Columns], stated: bool) -> str:
-    straight = prismatic(robot)
-    plain = "m" if all(straight) else "rad and m" if any(straight) else "rad"
-    text = {"rad": plain, "deg": "degrees", "mm": "mm"}[unit]
-    torque = " and its torque" if any(read.torque is not None for read in reads) else ""
-    return f"positions are in {text}: {'as stated' if stated else f'that fits the limits of {robot.name}{torque}'}"
-
-
-def _geared(robot: RobotModel, reads: Sequence[Columns], signs: list[float] | None) -> bool:
-    """Whether the torque shows rotors: inertia at a joint's own acceleration that the links do not have."""
-    found = 0
-    for read in (read for read in reads if read.torque is not None):
-        motion = sampled(read.time, read.position, None if read.torque is None else read.torque * (signs or 1.0))
-        if motion is None or motion.torque is None:
-            continue
-        nominal = rigid_torque(robot, motion)
-        for j in range(robot.nv):
-            v, a = motion.velocity[:, j], motion.acceleration[:, j]
-            rest = motion.torque[:, j] - nominal[:, j]
-            columns = np.column_stack([np.ones(len(v)), v, np.tanh(v / (0.1 * (np.sqrt(np.mean(v**2)) or 1.0))), a])
-            size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-            rotor = (np.linalg.lstsq(columns / size, rest, rcond=1e-8)[0] / size)[3]
-            found += rotor * np.std(a) > 0.1 * np.std(motion.torque[:, j])
-    return bool(found > 0)
-
-
-def _cutoff(reads: Sequence[Columns]) -> float:
-    """Highest frequency at which the position's steps make less than a tenth of the acceleration (Hz)."""
-    best = 20.0
-    for read in reads:
-        rate = (len(read.time) - 1) / read.time[-1]
-        motion = sampled(read.time, read.position)
-        best = min(best, 0.2 * rate)
-        for j in range(read.position.shape[1]) if motion is not None else ():
-            step = np.diff(np.unique(read.position[:, j]))
-            size = float(np.sqrt(np.mean(motion.acceleration[:, j] ** 2))) if motion is not None else 0.0
-            if len(step) and size > 0 and np.ptp(read.position[:, j]) > 0.05:
-                noise = float(np.median(step)) / np.sqrt(12) * np.sqrt(2 / rate / 5) * (2 * np.pi) ** 2  # at 1 Hz
-                best = min(best, max((0.1 * size / noise) ** 0.4, 2.0))
-    return float(f"{best:.2g}")
-
-
-def _text(
-    model: Path,
-    robot: RobotModel,
-    whole: RobotModel,
-    reads: Sequence[Columns],
-    unit: str,
-    signs: list[float] | None,
-    labels: Sequence[str | None],
-    assumed: Sequence[str],
-    drives: dict[str, Any],
-    gears: Sequence[float] | None = None,
-    listed: bool = False,
-) -> str:
-    from ..formats.export import dump_yaml
-
-    robot_keys: dict[str, Any] = {"model": str(model.resolve())}
-    if tuple(robot.joint_names) != tuple(whole.joint_names):
-        robot_keys["joints"] = list(robot.joint_names)
-    data = [_entry(read, unit, label, signs is not None) for read, label in zip(reads, labels, strict=True)]
-    parts = ["# Drafted by `figaroh-jax new`. What was assumed:", *(f"#   {line}" for line in assumed)]
-    unnamed = "the order of --joints" if listed else "the order of the model's joints"
-    order = "the columns' names" if all(read.named for read in reads) else unnamed
-    parts += [f"#   columns belong to joints by {order}", ""]
-    parts += [dump_yaml({"robot": robot_keys}), "# `role: holdout` keeps a recording out of the fit and predicts it."]
-    parts += [dump_yaml({"data": data})]
-    given = {"position": gears, "torque": signs}
-    sides = {key: [float(x) for x in values] for key, values in given.items() if values is not None}
-    if sides:
-        parts += [
-            "# From what the columns hold to the joints: rad (m) and N m (N).",
-            dump_yaml({"transmission": sides}),
-        ]
-    if drives:
-        parts += ["# The loop that turns the command into torque: N m/rad.", dump_yaml({"actuator": drives})]
-    if all(read.torque is None for read in reads):
-        return "\n".join(part.rstrip("\n") for part in parts) + "\n"
-    rotor = _geared(robot, reads, signs)
-    parts += [
-        "# The position's steps and rate allow this low pass (Hz).",
-        dump_yaml({"preprocess": {"cutoff": _cutoff(reads)}}),
-    ]
-    parts += [
-        "# `rotor: true` where the torque is that of geared motors; false where it is sensed behind the gears.",
-        dump_yaml({"baseline": {"viscous": True, "coulomb": True, "rotor": rotor, "offset": True}}),
-    ]
-    return "\n".join(part.rstrip("\n") for part in parts) + "\n"
-
-
-def _entry(read: Columns, unit: str, label: str | None, converted: bool) -> dict[str, Any]:
-    entry = {key: value for key, value in read.entry.items() if key != "units"}
-    units = dict(read.entry.get("units", {}))
-    if unit != "rad":
-        units["position"] = unit
-    if read.current and (converted or read.current != "A"):
-        units["torque"] = read.current
-    return entry | ({"units": units} if units else {}) | ({"repeat": label} if label else {}) | {"role": "fit"}
