@@ -17,9 +17,11 @@ import pytest
 import yaml
 
 from figaroh_jax import DEMO, cli
+from figaroh_jax.errors import InputError
 from figaroh_jax.reporting.provenance import provenance
 from figaroh_jax.reporting.run_directory import MARKER, check_directory, whole_directory
 from figaroh_jax.reporting.side_by_side import _values_of
+from figaroh_jax.rollouts.export import for_simulator
 
 CAUSE = {
     "effect": "torque_offset",
@@ -360,8 +362,16 @@ def test_the_export_of_another_run_says_what_to_take(tmp_path: Path, capsys):
     model.mkdir(parents=True)
     for name in ("robot.urdf", "effects.yaml"):
         (model / name).write_text("")
-    assert cli.main(["export", str(model), "--for", "mujoco"]) == 2
-    assert "the model of this run is in its robot.urdf, effects.yaml" in capsys.readouterr().err
+    for folder in (model, tmp_path / "run"):
+        assert cli.main(["export", str(folder), "--for", "mujoco"]) == 2
+        assert "the model of this run is in its robot.urdf, effects.yaml" in capsys.readouterr().err
     (model / "loop.json").write_text("{}")
     assert cli.main(["export", str(tmp_path / "run"), "--for", "mujoco"]) == 2
     assert f"{model / 'loop.json'}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("name", "said"), [("nix", "known: mujoco, "), ("mujocco", "did you mean 'mujoco'?")])
+def test_a_simulator_that_is_unknown_is_told_the_others_once(name: str, said: str):
+    with pytest.raises(InputError) as refused:
+        for_simulator({}, name)
+    assert said in str(refused.value) and str(refused.value).count("known: ") <= 1

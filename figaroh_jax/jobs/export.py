@@ -42,6 +42,7 @@ def export_loop(model: Path, simulator: str, out: Path | None = None) -> str:
 
 def _advice(model: Path) -> str:
     """What to name instead of a directory that holds no loop."""
+    model = model / "model" if (model / "model" / "effects.yaml").is_file() else model
     if (model / "effects.yaml").is_file():
         files = ", ".join(name for name in ("robot.urdf", "robot.xml", "effects.yaml") if (model / name).is_file())
         return f"only rollouts (a command, no torque) have one; the model of this run is in its {files}"

@@ -436,7 +436,7 @@ def for_simulator(content: dict[str, Any], name: str) -> dict[str, Any]:
     MuJoCo's are those of its actuators, the others' those of the joint that a drive turns, its gear counted in.
     """
     if name not in SIMULATORS:
-        raise InputError(f"--for {name}: unknown{nearest(name, SIMULATORS)}; known: {', '.join(SIMULATORS)}")
+        raise InputError(f"--for {name}: unknown simulator{nearest(name, SIMULATORS)}")
     words, meaning = SIMULATORS[name]
     if name == "mujoco" and content["integrator"] == "explicit":
         meaning = meaning.replace("damping is implicit", "damping is explicit")
