@@ -306,14 +306,6 @@ def test_a_clock_that_stops_is_told_by_its_row(made, tmp_path: Path):
         draft_task(urdf, [tmp_path / "run.npz"])
 
 
-def test_parts_of_a_time_are_told_what_to_write(made, tmp_path: Path):
-    urdf, _, (run, *_) = made
-    stamps = {"secs": np.floor(run["time"]), "nsecs": np.round(1e9 * (run["time"] % 1))}
-    np.savez(tmp_path / "run.npz", q=run["position"], tau=run["torque"], **stamps)
-    with pytest.raises(Undecided, match="secs, nsecs are parts of a time"):
-        draft_task(urdf, [tmp_path / "run.npz"])
-
-
 def test_columns_numbered_by_joints_called_j_are_read(made, tmp_path: Path):
     """`j1_pos` holds a position though many logs write torque as J; `current_position` holds no current."""
     urdf, joints, (run, *_) = made

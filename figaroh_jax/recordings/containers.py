@@ -6,6 +6,7 @@ import json
 import math
 import zipfile
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,21 +27,25 @@ def read_npz(file: Path) -> Table:
     with zipfile.ZipFile(file) as archive:
         entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
 
-    def read(name: str) -> np.ndarray:
+    def array(name: str) -> np.ndarray:
         try:
             with zipfile.ZipFile(file) as archive, archive.open(entries[name]) as stored:
                 _check_size(np.lib.format.read_magic(stored), stored, file, name)
             with np.load(file, allow_pickle=False) as arrays:
-                values = np.asarray(arrays[name])
+                return np.asarray(arrays[name])
         except InputError:
             raise
         except Exception as error:  # numpy, zipfile and zlib each have their own ways to say "damaged"
             if "allow_pickle" in str(error) or "Object arrays" in str(error):
                 raise InputError(f"{file}: array '{name}' holds Python objects, not numbers: it is refused") from error
             raise InputError(f"{file}: array '{name}' cannot be read: {error}") from error
-        return numbers(values, file, name)
 
-    return Table(file, tuple(entries), read)
+    def words(name: str) -> np.ndarray | None:
+        with suppress(InputError):  # an array that cannot be read is refused once its numbers are asked for
+            values = array(name)
+            return values.astype(str) if values.dtype.kind in "US" else None
+
+    return Table(file, tuple(entries), lambda name: numbers(array(name), file, name), words)
 
 
 def _check_size(version: tuple[int, int], stored: Any, file: Path, name: str) -> None:

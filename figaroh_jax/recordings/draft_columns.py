@@ -17,6 +17,7 @@ from jaxtyping import Float
 from ..errors import InputError
 from ..rigid.model import RobotModel
 from .dataset import Driven
+from .joined import in_halves
 from .reading import BAGS, kind_of, lerobot_episodes, read_table
 from .tables import Source, Table
 
@@ -252,14 +253,15 @@ def _words(name: str) -> list[str]:
 
 
 def _time(table: Table) -> str:
-    found = [name for name in table.names if name.lower() in _TIMES]
+    names = [name for name in table.names if name not in table.pieces]
+    found = [name for name in names if name.lower() in _TIMES] or [name for name in names if in_halves(name)]
     if not found and "received" in table.names:  # when a bag got a message that has no stamp of its own
         return "received"
-    found = found or [n for n in table.names if set(_words(n)) & {*_TIMES} and not set(_words(n)) & {"des", "cmd"}]
+    found = found or [n for n in names if set(_words(n)) & {*_TIMES} and not set(_words(n)) & {"des", "cmd"}]
     if not found and len(rising := _rising(table)) == 1:
         return rising[0]
     if len(found) != 1:
-        halves = [n for n in table.names if set(_words(n)) & _HALVES]
+        halves = [n for n in names if set(_words(n)) & _HALVES]
         if halves and not found:
             raise Undecided(
                 "rate",
@@ -336,8 +338,12 @@ def _kinds(table: Table, clock: str | None) -> dict[str, list[str]]:
         words = set(_PRESENT.sub("", " ".join(_words(name))).split())
         kind = next((k for k, known in _WORDS.items() if known & words), None)
         kind = name.partition(".")[0] if name.partition(".")[0] in _OF_BAGS else kind
-        if name != clock and kind is not None and not name.startswith("/") and not _has_parts(name, table.names):
+        told = name == clock or name in table.pieces or _has_parts(name, table.names)
+        if not told and kind is not None and not _of_another_topic(name) and table.words(name) is None:
             found.setdefault("torque" if kind == "effort" else kind, []).append(name)
+    positions = [name for name in found.get("position", ()) if set(_words(name)) & _WORDS["position"] - {"state"}]
+    if positions and "position" in found:  # `state` is the mode of the controller there
+        found["position"] = positions
     claimed = {name for names in found.values() for name in names} | {clock}
     plain = [n for n in table.names if n not in claimed and {"u", "ctrl"} & {*_words(n)[:1], *_words(n)[-1:]}]
     if "command" not in found and plain:
@@ -348,6 +354,11 @@ def _kinds(table: Table, clock: str | None) -> dict[str, list[str]]:
 _OTHERS = "|".join(sorted(_WORDS["position"] | _WORDS["velocity"] | _WORDS["torque"]))
 _PRESENT = re.compile(rf"\bcurrent (?=(?:{_OTHERS})\b)")  # `current_position` is where the joint is now, not a current
 _OF_BAGS = ("position", "velocity", "effort", "command")
+
+
+def _of_another_topic(name: str) -> bool:
+    """A bag's `/topic:column`, not the `/topic/column` of a topic that was written as text."""
+    return name.startswith("/") and ":" in name
 
 
 def _has_parts(name: str, names: Sequence[str]) -> bool:

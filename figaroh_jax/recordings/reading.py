@@ -14,6 +14,7 @@ from ..errors import InputError
 from ..formats.files import plain_file
 from .bags import read_bag
 from .containers import read_npz
+from .joined import joined
 from .reader_process import episodes_apart, read_apart
 from .tables import LARGEST, Source, Table
 from .textfiles import read_text
@@ -47,7 +48,8 @@ def read_table(file: Path, key: str, source: Source = _WHOLE) -> Table:
         with _damage(file, key, suffix):
             return table.read(name)
 
-    return table._replace(read=read)
+    guarded = table._replace(read=read)
+    return guarded if suffix in (*BAGS, "lerobot") or source.form is not None else joined(guarded)
 
 
 def lerobot_episodes(folder: Path, key: str) -> tuple[int, ...]:

@@ -39,6 +39,8 @@ class Table(NamedTuple):
     file: Path
     names: tuple[str, ...]
     read: Callable[[str], np.ndarray]
+    words: Callable[[str], np.ndarray | None] = lambda name: None  # the text of a column that holds no number
+    pieces: frozenset[str] = frozenset()  # of columns that are there as a whole too (see `joined`)
 
     def vector(self, name: str, key: str) -> Float[np.ndarray, " samples"]:
         """The one-dimensional array or column called `name`; `key` is the task's key that asks for it."""

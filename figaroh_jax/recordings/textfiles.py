@@ -58,7 +58,13 @@ def read_text(file: Path, form: str | None = None) -> Table:
         column = names.index(name)
         return numbers[:, column] if column not in texts else _as_time(file, name, texts[column])
 
-    return Table(file, names, read)
+    def words(name: str) -> np.ndarray | None:
+        cells = texts.get(names.index(name)) if names.count(name) == 1 else None
+        if cells is None or np.isfinite(numbers[:, names.index(name)]).any():
+            return None
+        return None if any(_number(cell) is not None or _iso(cell) for cell in {*cells}) else np.array(cells)
+
+    return Table(file, names, read, words)
 
 
 def _layout(file: Path) -> _Layout:
