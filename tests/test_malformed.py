@@ -157,7 +157,7 @@ def test_parquet_is_bounded_by_what_it_becomes(tmp_path: Path):
         np.zeros((4, 0), "U1"),
         np.array([b""] * 4),
         np.zeros(4, [("x", float)]),
-        np.zeros(4, "M8[s]"),
+        np.zeros(4, "m8[s]"),
     ],
 )
 def test_arrays_that_are_no_numbers_are_refused(tmp_path: Path, array: np.ndarray):

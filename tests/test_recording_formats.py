@@ -316,6 +316,31 @@ def test_parquet_of_pandas_is_read(made, tmp_path: Path):
     assert_read(drafted(urdf, tmp_path / "run.parquet", tmp_path)[1], run)
 
 
+@pytest.mark.parametrize("form", ["parquet", "npz"])
+def test_iso_times_as_words_are_a_clock_in_any_file(made, form: str, tmp_path: Path):
+    urdf, joints, run = made
+    stamps = np.datetime64("2024-05-01T10:00:00", "ns") + np.round(run["time"] * 1e9).astype("timedelta64[ns]")
+    words = np.char.add(np.datetime_as_string(stamps, unit="us"), "Z")
+    if form == "npz":
+        np.savez(tmp_path / "words.npz", time=words, q=run["position"], tau=run["torque"])
+        np.savez(tmp_path / "dates.npz", time=stamps, q=run["position"], tau=run["torque"])
+    else:
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        columns = {
+            f"{n}_{j}": run[kind][:, k]
+            for n, kind in (("q", "position"), ("tau", "torque"))
+            for k, j in enumerate(joints)
+        }
+        parquet.write_table(pa.table({"time": words.tolist(), **columns}), tmp_path / "words.parquet")
+        parquet.write_table(pa.table({"time": ["2024-05-01", None, "x"]}), tmp_path / "odd.parquet")
+        with pytest.raises(InputError, match="'time', row 2 .from 0.: 'x' is not a number"):
+            read_table(tmp_path / "odd.parquet", "data").read("time")
+    for file in sorted(tmp_path.glob("[wd]*")):
+        assert_read(drafted(urdf, file, tmp_path)[1], run)
+
+
 # Text
 
 

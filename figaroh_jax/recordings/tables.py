@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from jaxtyping import Float
 
 from ..errors import InputError, nearest
 
-__all__ = ["Source", "Table", "check_columns", "numbers"]
+__all__ = ["Source", "Table", "check_columns", "is_time", "numbers", "times"]
 
 LARGEST = 1 << 29  # bytes of one array, or of all columns of a table, once the numbers are float64; of a CSV file
 LARGEST_HEAD = 1 << 20  # bytes of a CSV file's first line
@@ -105,12 +106,17 @@ def check_columns(file: Path, count: int) -> None:
 
 
 def numbers(values: np.ndarray, file: Path, name: str) -> Float[np.ndarray, "..."]:
-    """As float64, or an `InputError` that shows the first entry that is no number."""
+    """As float64, dates as s since the first, or an `InputError` that shows the first entry that is no number."""
     if values.dtype.kind in "fiu":
         with np.errstate(over="ignore", invalid="ignore"):
             return values.astype(np.float64)
     if values.dtype.kind == "c":
         raise InputError(f"{file}: '{name}' holds complex numbers; real ones are expected")
+    if values.dtype.kind == "M" and values.size:
+        since = (values - values.reshape(-1)[0]) / np.timedelta64(1, "ns")  # NaN where there is no date
+        return since * 1e-9
+    if values.dtype.kind in "UO" and values.ndim == 1 and values.size and is_time(values[0]):
+        return times(["" if value is None else str(value) for value in values], file, name)
     if not values.size:
         raise InputError(f"{file}: '{name}' has shape {values.shape} and holds no number")
     for row, value in enumerate(values.reshape(len(values), -1)[:, 0] if values.ndim else [values]):
@@ -120,6 +126,37 @@ def numbers(values: np.ndarray, file: Path, name: str) -> Float[np.ndarray, "...
             shown = "an empty cell" if value is None else f"'{value}'"[:40]
             raise InputError(f"{file}: '{name}', row {row} (from 0): {shown} is not a number") from None
     raise InputError(f"{file}: '{name}' holds {values.dtype} values, expected numbers")
+
+
+def times(cells: Sequence[str], file: Path, name: str) -> Float[np.ndarray, " rows"]:
+    """Seconds since the first of ISO times; an `InputError` that shows the first cell that is neither."""
+    try:
+        stamps = [datetime.fromisoformat(_iso(cell)) for cell in cells]
+        return np.array([(stamp - stamps[0]).total_seconds() for stamp in stamps])
+    except (ValueError, TypeError):
+        row = next((k for k, cell in enumerate(cells) if cell and not _is_number(cell) and not is_time(cell)), 0)
+        shown = f"'{cells[row]}'"[:40] if cells[row] else "an empty cell"
+        raise InputError(f"{file}: '{name}', row {row} (from 0): {shown} is not a number") from None
+
+
+def is_time(cell: object) -> bool:
+    """Whether a cell is an ISO time, and no number."""
+    try:
+        return isinstance(cell, str) and not _is_number(cell) and bool(datetime.fromisoformat(_iso(cell)))
+    except ValueError:
+        return False
+
+
+def _iso(cell: str) -> str:
+    return cell.strip().replace(" UTC", "+00:00")
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def _first(names: Sequence[str], wanted) -> str | None:

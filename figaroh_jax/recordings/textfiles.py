@@ -10,7 +10,6 @@ import csv
 import io
 import re
 from collections.abc import Iterator, Sequence
-from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +18,7 @@ from jaxtyping import Float
 
 from ..errors import InputError
 from .progress import told
-from .tables import LARGEST_HEAD, Table, check_columns
+from .tables import LARGEST_HEAD, Table, check_columns, is_time, times
 
 __all__ = ["LIBFRANKA", "read_text"]
 
@@ -56,13 +55,13 @@ def read_text(file: Path, form: str | None = None) -> Table:
         if names.count(name) > 1:
             raise InputError(f"{file}: the column '{name}' appears twice")
         column = names.index(name)
-        return numbers[:, column] if column not in texts else _as_time(file, name, texts[column])
+        return numbers[:, column] if column not in texts else times(texts[column], file, name)
 
     def words(name: str) -> np.ndarray | None:
         cells = texts.get(names.index(name)) if names.count(name) == 1 else None
         if cells is None or np.isfinite(numbers[:, names.index(name)]).any():
             return None
-        return None if any(_number(cell) is not None or _iso(cell) for cell in {*cells}) else np.array(cells)
+        return None if any(_number(cell) is not None or is_time(cell) for cell in {*cells}) else np.array(cells)
 
     return Table(file, names, read, words)
 
@@ -242,24 +241,6 @@ def _slowly(file: Path, block: str, layout: _Layout, texts: dict[int, list[str]]
     for cells in texts.values():
         cells += [""] * (before + len(split) - len(cells))
     return out
-
-
-def _as_time(file: Path, name: str, cells: Sequence[str]) -> Float[np.ndarray, " rows"]:
-    """Seconds since the first of ISO times; an `InputError` that shows the first cell that is neither."""
-    try:
-        stamps = [datetime.fromisoformat(cell.strip().replace(" UTC", "+00:00")) for cell in cells]
-        return np.array([(stamp - stamps[0]).total_seconds() for stamp in stamps])
-    except (ValueError, TypeError):
-        row = next((k for k, cell in enumerate(cells) if cell and _number(cell) is None and not _iso(cell)), 0)
-        shown = f"'{cells[row]}'"[:40] if cells[row] else "an empty cell"
-        raise InputError(f"{file}: '{name}', row {row} (from 0): {shown} is not a number") from None
-
-
-def _iso(cell: str) -> bool:
-    try:
-        return bool(datetime.fromisoformat(cell.strip().replace(" UTC", "+00:00")))
-    except ValueError:
-        return False
 
 
 def _libfranka(names: Sequence[str]) -> tuple[str, ...]:
