@@ -302,7 +302,23 @@ def test_a_clock_that_stops_is_told_by_its_row(made, tmp_path: Path):
     time = np.array(run["time"])
     time[40] = time[39]
     np.savez(tmp_path / "run.npz", t=time, q=run["position"], tau=run["torque"])
-    with pytest.raises(InputError, match=r"'t' is no clock of the positions: in row 40 \(from 0\)"):
+    with pytest.raises(InputError, match=r"'t' is no clock of the positions: in row 40 \(from 0\).*leave the row out"):
+        draft_task(urdf, [tmp_path / "run.npz"])
+    time[40:] -= 0.5
+    np.savez(tmp_path / "run.npz", t=time, q=run["position"], tau=run["torque"])
+    with pytest.raises(InputError, match="cut the file where another recording begins"):
+        draft_task(urdf, [tmp_path / "run.npz"])
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("t", "'t' is nan"), ("q", "position of turn is nan"), ("tau", "torque of")]
+)
+def test_numbers_that_are_none_are_told_what_to_do(made, name: str, said: str, tmp_path: Path):
+    urdf, _, (run, *_) = made
+    arrays = {"t": np.array(run["time"]), "q": run["position"].copy(), "tau": run["torque"].copy()}
+    arrays[name][7:9] = np.nan
+    np.savez(tmp_path / "run.npz", **arrays)
+    with pytest.raises(InputError, match=rf"{said}.*in row 7 \(from 0\).*leave such rows out, stamps and all"):
         draft_task(urdf, [tmp_path / "run.npz"])
 
 

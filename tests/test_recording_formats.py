@@ -372,6 +372,19 @@ def test_decimal_commas_iso_times_empty_cells_and_words(tmp_path: Path):
         table.read("state")
 
 
+@pytest.mark.parametrize("clock", ["{:.3f}", "2024-05-01T10:00:00.{:.3f}Z"])
+def test_rows_that_were_written_twice_are_read_once_beside_words_and_gaps(clock: str, tmp_path: Path):
+    stamps = [clock.format(0.01 * k).replace(".0.", ".") for k in range(50)]
+    rows = [f"{stamp},{0.1 * k},,RUN" for k, stamp in enumerate(stamps)]
+    (tmp_path / "run.csv").write_text("\n".join(["time,q1,gap,state", *rows[:20], rows[19], *rows[20:], rows[-1]]))
+    table = read_table(tmp_path / "run.csv", "data")
+    np.testing.assert_allclose(table.read("time"), 0.01 * np.arange(50), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(table.read("q1"), 0.1 * np.arange(50), rtol=0, atol=1e-9)
+    still = [f"{stamp},RUN" for stamp in ("1", "1", "1")]
+    (tmp_path / "run.csv").write_text("\n".join(["q1,state", *still]))  # no clock says that they are the same row
+    assert len(read_table(tmp_path / "run.csv", "data").read("q1")) == 3
+
+
 @pytest.mark.parametrize("between", [";", "\t", "|", " ", ","])
 def test_decimal_commas_between_any_delimiters(tmp_path: Path, between: str):
     file = tmp_path / "run.txt"

@@ -22,7 +22,7 @@ from ..rigid.inertia import from_com, transform
 from ..rigid.model import RobotModel
 from .groupmotion import position_names
 from .reading import read_table
-from .tables import Source, Table
+from .tables import Source, Table, leave_out, not_increasing
 from .wild import bridged, without_wild_rows
 
 if TYPE_CHECKING:
@@ -322,8 +322,7 @@ def _columns(table: Table, source, names: Sequence[str], key: str, samples: int 
         name = source if isinstance(source, str) else source[column] if len(source) == len(names) else ", ".join(source)
         raise InputError(
             f"{table.file}: {key} ('{name}') is {values[row, column]} in row {row} (from 0), column {column},"
-            f" joint {names[column]}; {len(wrong)} such value{'s' if len(wrong) > 1 else ''} in all;"
-            " leave such rows out, stamps and all: gaps of the time are seen"
+            f" joint {names[column]}; {leave_out(len(wrong))}"
         )
     return values
 
@@ -367,14 +366,18 @@ def read_time(table: Table, entry: RecordingEntry, key: str, samples: int) -> Fl
         raise InputError(f"{table.file}: {key}.time has {len(time)} samples, but position has {samples}")
     wrong = np.flatnonzero(~np.isfinite(time))
     if len(wrong):
-        raise InputError(f"{table.file}: {key}.time ('{entry.time}') is {time[wrong[0]]} in row {wrong[0]} (from 0)")
+        raise InputError(
+            f"{table.file}: {key}.time ('{entry.time}') is {time[wrong[0]]} in row {wrong[0]} (from 0);"
+            f" {leave_out(len(wrong))}"
+        )
     back = np.flatnonzero(np.diff(time) <= 0)
     unit = entry.units.time
     if len(back):
-        row = back[0] + 1
+        row = int(back[0]) + 1
         what = "repeats" if time[row] == time[row - 1] else "goes back"
         raise InputError(
             f"{table.file}: {key}.time {what} in row {row} (from 0): {time[row]:.9g} {unit} after"
-            f" {time[row - 1]:.9g} {unit}; the stamps must increase"
+            f" {time[row - 1]:.9g} {unit}; the stamps must increase;"
+            f" {not_increasing(time, row, '`rate`')}"
         )
     return time * _SECONDS[unit]

@@ -19,7 +19,7 @@ from ..rigid.model import RobotModel
 from .dataset import Driven
 from .joined import in_halves
 from .reading import BAGS, kind_of, lerobot_episodes, read_table
-from .tables import Source, Table
+from .tables import Source, Table, leave_out, not_increasing
 
 __all__ = ["Columns", "Commands", "Undecided", "read_columns", "read_commands", "without_sign"]
 
@@ -321,12 +321,17 @@ def _increasing(table: Table, clock: str, samples: int, of: str) -> Float[np.nda
     time = table.vector(clock, "time")
     if len(time) != samples:
         raise InputError(f"{table.file}: '{clock}' is not the {of}' clock: it has {len(time)} rows of {samples}")
+    wrong = np.flatnonzero(~np.isfinite(time))
+    if len(wrong):
+        raise InputError(
+            f"{table.file}: '{clock}' is {time[wrong[0]]} in row {wrong[0]} (from 0); {leave_out(len(wrong))}"
+        )
     back = np.flatnonzero(~(np.diff(time) > 0))
     if len(back):
-        row = back[0] + 1
+        row = int(back[0]) + 1
         raise InputError(
             f"{table.file}: '{clock}' is no clock of the {of}: in row {row} (from 0) it is {time[row]:.9g} after"
-            f" {time[row - 1]:.9g}, and the stamps must increase"
+            f" {time[row - 1]:.9g}, and the stamps must increase; {not_increasing(time, row, '--rate')}"
         )
     return time
 
@@ -497,7 +502,10 @@ def _matrix(table: Table, source: Any, joints: Sequence[str], key: str) -> Float
     wrong = np.argwhere(~(np.abs(values) < _HUGE))
     if len(wrong) and key != "velocity":  # which no draft uses
         row, column = wrong[0]
-        raise InputError(f"{table.file}: {key} of {joints[column]} is {values[row, column]:.4g} in row {row} (from 0)")
+        raise InputError(
+            f"{table.file}: {key} of {joints[column]} is {values[row, column]:.4g} in row {row} (from 0);"
+            f" {leave_out(len(wrong))}"
+        )
     return values
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from ..errors import InputError, nearest
 
-__all__ = ["Source", "Table", "check_columns", "is_time", "numbers", "times"]
+__all__ = ["Source", "Table", "check_columns", "is_time", "leave_out", "not_increasing", "numbers", "times"]
 
 LARGEST = 1 << 29  # bytes of one array, or of all columns of a table, once the numbers are float64; of a CSV file
 LARGEST_HEAD = 1 << 20  # bytes of a CSV file's first line
@@ -126,6 +126,31 @@ def numbers(values: np.ndarray, file: Path, name: str) -> Float[np.ndarray, "...
             shown = "an empty cell" if value is None else f"'{value}'"[:40]
             raise InputError(f"{file}: '{name}', row {row} (from 0): {shown} is not a number") from None
     raise InputError(f"{file}: '{name}' holds {values.dtype} values, expected numbers")
+
+
+def leave_out(count: int) -> str:
+    """What to do about values that are no numbers."""
+    return (
+        f"{count} such value{'s' if count > 1 else ''} in all; leave such rows out, stamps and all: gaps of the time"
+        " are seen"
+    )
+
+
+def not_increasing(time: Float[np.ndarray, " samples"], row: int, option: str) -> str:
+    """What to do about stamps that do not increase at `row`; `option` states a rate in their place."""
+    steps = np.diff(time)
+    if steps[row - 1] == 0 and (steps >= 0).all():
+        count = int((steps == 0).sum())
+        return (
+            f"{count} row{'s have' if count > 1 else ' has'} the stamp of the row before: leave the row"
+            f"{'s' * (count > 1)} out, stamps and all (gaps of the time are seen), or give {option} where the samples"
+            " are even and their stamps alone are wrong"
+        )
+    return (
+        "leave rows that were written again out, and cut the file where another recording begins"
+        if steps[row - 1] < 0
+        else "leave such rows out, stamps and all (gaps of the time are seen)"
+    )
 
 
 def times(cells: Sequence[str], file: Path, name: str) -> Float[np.ndarray, " rows"]:

@@ -186,18 +186,25 @@ def _read(file: Path, layout: _Layout) -> tuple[Float[np.ndarray, "rows columns"
             told(f"reading {file.name}", share)
     if not row:
         raise InputError(f"{file} is not a table of numbers with a header line: there is no row below its header")
-    return _without_repeats(np.concatenate(parts), texts), texts
+    return _without_repeats(np.concatenate(parts), texts)
 
 
 def _without_repeats(
     numbers: Float[np.ndarray, "rows columns"], texts: dict[int, list[str]]
-) -> Float[np.ndarray, "some columns"]:
+) -> tuple[Float[np.ndarray, "some columns"], dict[int, list[str]]]:
     """The rows without those that were written twice, where a column that else rises shows that they were."""
-    again = np.append(False, (numbers[1:] == numbers[:-1]).all(axis=1))
-    steps = np.diff(numbers[~again], axis=0)
-    if texts or not again.any() or not len(steps) or not (steps > 0).all(axis=0).any():
-        return numbers
-    return numbers[~again]
+    words = {column: np.array(cells) for column, cells in texts.items()}
+    same = (numbers[1:] == numbers[:-1]) | (np.isnan(numbers[1:]) & np.isnan(numbers[:-1]))
+    again = np.append(False, same.all(axis=1))
+    for cells in words.values():
+        again[1:] &= cells[1:] == cells[:-1]
+    kept = numbers[~again]
+    if not again.any() or len(kept) < 2:
+        return numbers, texts
+    stamps = [cells[~again] for cells in words.values() if is_time(str(cells[0]))]
+    if not (np.diff(kept, axis=0) > 0).all(axis=0).any() and not any((x[1:] > x[:-1]).all() for x in stamps):
+        return numbers, texts
+    return kept, {column: cells[~again].tolist() for column, cells in words.items()}
 
 
 def _fast(block: str, layout: _Layout) -> np.ndarray | None:
