@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from pathlib import Path
 from typing import Any
@@ -413,6 +414,34 @@ def test_what_is_no_table_is_said_with_its_row(tmp_path: Path, text: str, said: 
     (tmp_path / "run.csv").write_text(text)
     with pytest.raises(InputError, match=said):
         read_table(tmp_path / "run.csv", "data")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "utf-16-be"])
+@pytest.mark.parametrize("packed", [False, True])
+def test_text_of_spreadsheets_and_packed_text_is_read(made, encoding: str, packed: bool, tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("figaroh_jax.recordings.textfiles._BLOCK", 1 << 12)
+    urdf, joints, run = made
+    names = ["t", *(f"q_{joint}" for joint in joints), *(f"tau_{joint}" for joint in joints)]
+    rows = np.column_stack([run["time"], run["position"], run["torque"]]).tolist()
+    text = "\r\n".join(["\t".join(names), *("\t".join(map(repr, row)) for row in rows)])
+    content = ("\ufeff" * (encoding == "utf-16-be") + text).encode(encoding)
+    file = tmp_path / ("run.csv.gz" if packed else "run.csv")
+    file.write_bytes(gzip.compress(content) if packed else content)
+    assert_read(drafted(urdf, file, tmp_path)[1], run)
+
+
+def test_packed_text_that_is_damaged_or_too_long_is_told(tmp_path: Path, monkeypatch):
+    file = tmp_path / "run.csv.gz"
+    content = gzip.compress(b"t,q\n" + b"".join(b"%d,%d\n" % (k, k * k) for k in range(9000)))
+    for damaged in (content[: len(content) // 2], b"t,q\n1,2\n"):
+        file.write_bytes(damaged)
+        with pytest.raises(InputError, match=r"run\.csv\.gz"):
+            read_table(file, "data")
+    file.write_bytes(content)
+    assert len(read_table(file, "data").read("q")) == 9000
+    monkeypatch.setattr("figaroh_jax.recordings.textfiles.LARGEST", 1 << 16)
+    with pytest.raises(InputError, match="of text, unpacked; split it"):
+        read_table(file, "data")
 
 
 def test_numbers_without_a_header_are_columns_by_number(tmp_path: Path):

@@ -77,12 +77,13 @@ def _damage(file: Path, key: str, suffix: str) -> Iterator[None]:
 
 
 def kind_of(file: Path) -> str:
-    """The suffix of a file; "rosbag2" or "lerobot" for a folder that is one."""
+    """The suffix of a file, that of the text in a `.gz`; "rosbag2" or "lerobot" for a folder that is one."""
     if os.path.isfile(file / "metadata.yaml"):
         return "rosbag2"
     if os.path.isfile(file / "meta" / "info.json"):
         return "lerobot"
-    return file.suffix.lower()
+    inside = Path(file.stem).suffix.lower()
+    return inside if file.suffix.lower() == ".gz" and inside in TEXT else file.suffix.lower()
 
 
 _READERS: dict[str, Callable[[Path, Source], Table]] = {

@@ -6,19 +6,22 @@ written twice, stamp and all, is read once.
 
 from __future__ import annotations
 
+import codecs
 import csv
+import gzip
 import io
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import InputError
 from .progress import told
-from .tables import LARGEST_HEAD, Table, check_columns, is_time, times
+from .tables import LARGEST, LARGEST_HEAD, Table, check_columns, is_time, times
 
 __all__ = ["LIBFRANKA", "read_text"]
 
@@ -89,8 +92,32 @@ def _layout(file: Path) -> _Layout:
     return _Layout((names[0].lstrip("#%").strip(), *names[1:]), delimiter, first, decimal)
 
 
+class _Recoded:
+    """UTF-16, as spreadsheets save it, as the bytes of UTF-8."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self.text = io.TextIOWrapper(stream, encoding="utf-16", newline="")
+
+    def read(self, size: int) -> bytes:
+        return self.text.read(size).encode()
+
+    def readline(self, size: int = -1) -> bytes:
+        return self.text.readline(size).encode()
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[tuple[IO[bytes] | _Recoded, IO[bytes]]]:
+    """The text's bytes, unpacked and in UTF-8 where it was written in UTF-16, and those of the file."""
+    with file.open("rb") as raw:
+        packed = file.suffix.lower() == ".gz"
+        stream: IO[bytes] = cast("IO[bytes]", gzip.GzipFile(fileobj=raw)) if packed else raw
+        mark = stream.read(2)
+        stream.seek(0)
+        yield (_Recoded(stream) if mark in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else stream), raw
+
+
 def _first_lines(file: Path) -> list[str]:
-    with file.open("rb") as stream:
+    with _opened(file) as (stream, _):
         head = stream.readline(LARGEST_HEAD)
         if len(head) == LARGEST_HEAD:
             raise InputError(
@@ -151,15 +178,18 @@ def _number(cell: str, decimal: str = ".") -> float | None:
 
 def _blocks(file: Path, skipped: int) -> Iterator[tuple[str, float]]:
     """Whole lines of the file below the header, and the share of the file that is read."""
-    size, left = max(file.stat().st_size, 1), b""
-    with file.open("rb") as stream:
+    size, left, read = max(file.stat().st_size, 1), b"", 0
+    with _opened(file) as (stream, raw):
         for _ in range(skipped):
             stream.readline()
         while block := stream.read(_BLOCK):
             whole, mark, rest = (left + block).rpartition(b"\n")
             left = rest
+            read += len(block)
+            if read > LARGEST:
+                raise InputError(f"{file}: more than {LARGEST >> 20} MiB of text, unpacked; split it")
             if mark:
-                yield _decoded(file, whole), stream.tell() / size
+                yield _decoded(file, whole), raw.tell() / size
     if left.strip():
         yield _decoded(file, left), 1.0
 
