@@ -255,6 +255,20 @@ def test_the_task_of_postures_lists_the_joints_that_the_file_holds(made, tmp_pat
     assert f"robot: {{model: MODEL, joints: [{joints[0]}, {joints[1]}]}}" in str(caught.value)
 
 
+def test_the_task_of_postures_reads_units_in_the_names_of_columns(made, tmp_path: Path):
+    """Columns as `A1 [deg]`, one for each joint, and `X [mm]`: the task that the message shows is one that is read."""
+    urdf, joints, (run, *_) = made
+    columns = {f"A{j + 1} [deg]": np.rad2deg(run["position"][:30, j]) for j in range(3)}
+    columns |= {f"{axis} [mm]": np.linspace(0, 1, 30) for axis in "XYZ"}
+    with pytest.raises(InputError, match="look like measured poses or points") as told:
+        draft_task(urdf, [table(tmp_path / "postures.csv", columns)])
+    task = yaml.safe_load(str(told.value).split("The task is\n")[1].split("\nwhere")[0])
+    (entry,) = task["data"]
+    assert entry["position"] == ["A1 [deg]", "A2 [deg]", "A3 [deg]"]
+    assert entry["units"] == {"position": "deg", "measurement": "mm"}
+    assert entry["measurement"]["position"] == ["X [mm]", "Y [mm]", "Z [mm]"]
+
+
 def test_the_task_of_poses_with_quaternions_names_every_column(made, tmp_path: Path):
     """Joints `q1` to `q3` beside a quaternion `qx` to `qw`: what the message shows is read as it stands."""
     urdf, joints, (run, *_) = made

@@ -195,7 +195,9 @@ def _refuse_postures(table: Table, model: RobotModel) -> None:
         return
     named = [n for n in table.names if n in model.joint_names]
     whole = table.file.suffix.lower() in (".npz", ".mat", ".h5")
-    columns = named or (kinds.get("position") or ["JOINTS"])[: 1 if whole else None]
+    rest = [n for n in table.names if n not in measured]
+    columns = rest if not kinds.get("position") and len(rest) == len(model.joint_names) > 1 else ["JOINTS"]
+    columns = named or (kinds.get("position") or columns)[: 1 if whole else None]
     position = columns if named or len(columns) > 1 else columns[0]
     turned = [name for axis in "xyzw" for name in table.names if re.fullmatch(rf"q_?{axis}", name, re.IGNORECASE)]
     if not whole and len(measured) == 3 and len(turned) == 4:
@@ -222,7 +224,9 @@ def _refuse_postures(table: Table, model: RobotModel) -> None:
     )
 
 
-_MEASURED = re.compile(r"^(?:[xyz]\d*|T_\w+|.*(?:pose|xyz|marker|point|board).*)$", re.IGNORECASE)
+_MEASURED = re.compile(
+    r"^(?:[xyz]\d*(?:[ _]?[\[(]?(?:mm|m)[\])]?)?|T_\w+|.*(?:pose|xyz|marker|point|board).*)$", re.IGNORECASE
+)
 
 
 def _holds_any(column: str, names: Sequence[str]) -> bool:
