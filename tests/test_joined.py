@@ -120,8 +120,8 @@ def test_the_state_of_a_controller_is_no_position(made, tmp_path: Path):
     """Its mode as a word or a number beside a running index, as pandas writes it."""
     urdf, joints, run = made
     count = np.arange(len(run["time"]))
-    for mode in (np.full(len(count), "RUN"), np.full(len(count), 3)):
-        columns = {"": count, "t": run["time"], "state": mode}
+    for clock, mode in (("t", np.full(len(count), "RUN")), ("Zeit", np.full(len(count), 3))):
+        columns = {"": count, clock: run["time"], "state": mode}
         columns |= {f"q_{joint}": run["position"][:, j] for j, joint in enumerate(joints)}
         columns |= {f"tau_{joint}": run["torque"][:, j] for j, joint in enumerate(joints)}
         lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]

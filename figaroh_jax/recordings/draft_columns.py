@@ -296,7 +296,13 @@ def _rising(table: Table) -> list[str]:
         step = float(np.median(steps))
         if np.mean(np.abs(steps - step) <= 0.5 * step) > _ALIKE:
             out.append(name)
-    return out
+    clocks = [name for name in out if not _counts(np.asarray(table.read(name), float))]
+    return clocks if len(out) > 1 else out
+
+
+def _counts(values: Float[np.ndarray, " samples"]) -> bool:
+    """Whether a column is the running number of its row, as pandas writes it."""
+    return bool(values[0] in (0, 1) and (np.diff(values) == 1).all())
 
 
 def _stamps(
