@@ -62,6 +62,12 @@ def check_list(name: str, given: Any) -> None:
         raise InputError(f"{name} is one {type(given).__name__}; a list is expected, of one too: [{name[:-1]}]")
 
 
+def check_names(name: str, given: Any) -> None:
+    """Refuse one text where a list of names is expected: its letters would be taken for names."""
+    if isinstance(given, str):
+        raise InputError(f"{name} is the text '{given[:100]}'; a list is expected, of one name too: ['{given[:100]}']")
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Text that names the known word nearest to `name`, or lists all of them: `"; did you mean 'joint_3'?"`."""
     words = [str(word) for word in islice(known, _MOST_KNOWN)]

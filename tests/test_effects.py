@@ -518,3 +518,11 @@ def test_a_law_of_ones_own_says_which_one_contains_it():
     finally:
         outer.contains = before
         fj.CATALOGUE.pop("oil_churning", None)
+
+
+def test_a_name_that_the_catalogue_lacks_is_a_key_error_with_the_nearest():
+    with pytest.raises(InputError, match="^no effect 'stribek' in the catalogue; did you mean 'stribeck_friction'"):
+        CATALOGUE["stribek"]
+    with pytest.raises(KeyError):
+        CATALOGUE["stribek"]
+    assert "stribek" not in CATALOGUE and CATALOGUE.get("stribek") is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -12,6 +13,7 @@ import optimistix
 import pytest
 
 import figaroh_jax as fj
+from figaroh_jax.estimation.free import chosen_of
 
 T = np.arange(1500)[:, None] / 250.0
 RATES = 2 * np.pi * np.array([0.5, 0.7, 0.9, 1.1])
@@ -109,6 +111,22 @@ def test_limits_hold_and_a_prior_pulls(robot: fj.RobotModel, tracked: tuple[fj.P
 def test_what_is_not_there_cannot_be_free(free, message: str, robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...]):
     with pytest.raises(fj.InputError, match=message):
         fj.fit(robot, tracked, free)
+
+
+def test_names_with_spaces_are_places_as_a_whole(tmp_path: Path):
+    text = Path(fj.DEMO).read_text()
+    for old, new in (("elbow", "axis 5"), ("wrist", "axis"), ("shoulder", "5")):
+        text = text.replace(f'name="{old}"', f'name="{new}"')
+    (tmp_path / "robot.urdf").write_text(text)
+    robot = fj.load_urdf(tmp_path / "robot.urdf")
+    model = fj.extend(robot, *(place(robot, "viscous_friction", name) for name in ("5", "axis", "axis 5")))
+    for kind in ("joint_offset", "friction"):
+        for name in ("5", "axis", "axis 5"):
+            (found,) = chosen_of(model, (), {kind: name}).names
+            assert found.split(maxsplit=1)[1].removesuffix(" damping") == name
+        assert len(chosen_of(model, (), {kind: ["axis 5", "5"]}).names) == 2
+    assert chosen_of(model, (), {"friction": "damping axis 5"}).names == ("viscous_friction axis 5 damping",)
+    assert chosen_of(model, (), {"inertia": f"inertia {robot.link_names[0]} mx"}).names[0].endswith(" mx")
 
 
 def test_everything_can_be_free_at_once(robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...]):

@@ -163,6 +163,15 @@ def test_only_the_joints_asked_for_are_fitted(truth: Truth):
     assert np.isfinite(found.fit.rms).tolist() == [True, False, False]
     with pytest.raises(InputError, match="no moving joint 'sholder'.*shoulder"):
         identify(truth.nominal, [recording(truth, seed=1)], SETTINGS, joints=["sholder"])
+    with pytest.raises(InputError, match="joints is the text 'shoulder'; a list is expected"):
+        identify(truth.nominal, [recording(truth, seed=1)], SETTINGS, joints="shoulder")
+
+
+def test_a_joint_whose_name_begins_like_anothers_is_not_asked_for_with_it(truth: Truth):
+    first, second, *others = truth.nominal.joints
+    renamed = replace(truth.nominal, joints=(first, second._replace(name=f"{first.name}.j2"), *others))
+    found = identify(renamed, [recording(truth, seed=1)], SETTINGS, joints=[first.name])
+    assert np.isfinite(found.fit.rms).tolist() == [True, False, False]
 
 
 def test_a_known_payload_is_no_part_of_the_robot(truth: Truth):

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pinocchio as pin
 import pytest
 import reference
 import robots
 
+import figaroh_jax as fj
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.rigid import kinematics
@@ -90,3 +93,24 @@ def test_an_unknown_frame_is_refused_with_the_nearest_name(tmp_path: Path) -> No
     model = robots.load(robots.TREE, tmp_path)
     with pytest.raises(InputError, match="no frame 'fingr'; did you mean 'finger'"):
         kinematics.frame_placement(model, np.zeros(model.nv), "fingr")
+
+
+def test_what_is_no_model_or_no_name_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # these tests alone check types
+    model = robots.load(robots.TREE, tmp_path)
+    q: Any = np.zeros(model.nv)
+    wrong: Any
+    for wrong, told in (
+        ("r.urdf", "model is the text 'r.urdf'; a RobotModel is expected: load_urdf"),
+        (fj.extend(model), "model is of type ExtendedModel.*give its `.robot`"),
+        (q, "model is of type ndarray"),
+    ):
+        with pytest.raises(InputError, match=told):
+            fj.inverse_dynamics(wrong, q, q, q)
+        for function in (fj.frame_placement, fj.frame_jacobian):
+            with pytest.raises(InputError, match=told):
+                function(wrong, q, "finger")
+    wrong = "finger"
+    for function in (fj.frame_placement, fj.frame_jacobian):
+        with pytest.raises(InputError, match=r"name is of type ndarray; .* expected: \(model, q, name\)"):
+            function(model, wrong, q)

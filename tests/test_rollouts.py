@@ -262,6 +262,18 @@ def test_a_command_of_another_shape_and_a_loop_that_diverges_are_told(tmp_path: 
         rollout(loop, np.ones((2000, 1)), np.zeros(1))
 
 
+def test_a_number_that_is_not_finite_is_no_gain_that_diverges(tmp_path: Path):
+    loop, _ = load_loop(written(tmp_path, chain(2, "Euler")))
+    command = np.zeros((20, 2))
+    command[3, 1] = np.nan
+    with pytest.raises(InputError, match="command, row 3, u1: nan; finite numbers are expected"):
+        rollout(loop, command, np.zeros(2))
+    with pytest.raises(InputError, match="position, j1: inf; finite"):
+        rollout(loop, np.zeros((20, 2)), np.array([0.0, np.inf]))
+    with pytest.raises(InputError, match="velocity, j0: nan; finite"):
+        rollout(loop, np.zeros((20, 2)), np.zeros(2), np.array([np.nan, 0.0]))
+
+
 def test_friction_that_follows_the_load_holds_a_weight_within_its_law(tmp_path: Path):
     """Load w, drive m, friction up to r |m + w| (m against w): it holds for (1 - r) / (1 + r) < m / w < its inverse."""
     inertial = '<inertial pos="0.3 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>'

@@ -13,6 +13,7 @@ import reference
 import robots
 from robots import joint, link, robot
 
+import figaroh_jax as fj
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.robotfile import load_extended
 from figaroh_jax.formats.urdf import load_urdf
@@ -207,6 +208,10 @@ OPTIONS = {
     "joint twice": ({"joints": ["hip", "hip"]}, "two of the moving joints are called 'hip'"),
     "fixed joint": ({"joints": ["weld"]}, "joints: joint 'weld' is fixed"),
     "mimic joint": ({"joints": ["copy"]}, "joints: joint 'copy' mimics 'knee'; name that joint"),
+    "text for joints": (
+        {"joints": "knee"},
+        r"joints is the text 'knee'; a list is expected, of one name too: \['knee'\]",
+    ),
     "no joints": ({"joints": []}, "no joint moves"),
     "unknown posture": ({"posture": {"hop": 0.0}}, "posture: there is no joint 'hop'"),
     "posture of a moving joint": ({"joints": ["hip"], "posture": {"hip": 0.0}}, "'hip' is one of the moving joints"),
@@ -221,6 +226,18 @@ def test_wrong_joints_and_postures_are_refused_by_name(name: str, tmp_path: Path
     options, message = OPTIONS[name]
     with pytest.raises(InputError, match=message):
         robots.load(robots.TREE, tmp_path, **options)
+
+
+def test_one_joints_name_is_no_list_of_an_mjcf_either(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    file = tmp_path / "robot.xml"
+    file.write_text(
+        '<mujoco><worldbody><body><freejoint name="root"/><geom size=".1"/><body><joint name="j"/><geom size=".1"/>'
+        "</body></body></worldbody></mujoco>"
+    )
+    for read in (fj.load_mjcf, fj.load_extended):
+        with pytest.raises(InputError, match="joints is the text 'j'"):
+            read(file, joints="j")
 
 
 def test_files_that_are_no_text_files_are_refused(tmp_path: Path) -> None:

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from typing import NoReturn
+
 from ..errors import InputError, nearest
 from .base import Effect
 
 __all__ = ["CATALOGUE", "POSES", "ROLLOUTS", "find", "register", "related"]
 
-CATALOGUE: dict[str, type[Effect]] = {}  # that a diagnosis of torques looks for
+
+class UnknownEffect(InputError, KeyError):
+    """A name that no effect has: a `KeyError` of the catalogue, with the nearest known name."""
+
+    __str__ = Exception.__str__  # that of KeyError quotes
+
+
+class _Named(dict[str, type[Effect]]):
+    def __missing__(self, name: str) -> NoReturn:
+        raise UnknownEffect(f"no effect '{name}' in the catalogue{nearest(name, self)}")
+
+
+CATALOGUE: dict[str, type[Effect]] = _Named()  # that a diagnosis of torques looks for
 POSES: dict[str, type[Effect]] = {}  # that a calibration and a diagnosis of postures look for
 ROLLOUTS: dict[str, type[Effect]] = {}  # that a diagnosis of rollouts looks for, as they are called there
 _OTHERS: dict[str, type[Effect]] = {}  # known by name, but nothing that a diagnosis looks for
@@ -50,7 +64,7 @@ def find(name: str) -> type[Effect]:
     """The effect called `name`; raises `InputError` with the nearest known name."""
     known = CATALOGUE | _OTHERS
     if name not in known:
-        raise InputError(f"no effect '{name}' in the catalogue{nearest(name, known)}")
+        raise UnknownEffect(f"no effect '{name}' in the catalogue{nearest(name, known)}")
     return known[name]
 
 

@@ -71,6 +71,7 @@ class Part(NamedTuple):
     names: tuple[str, ...]
     units: tuple[str, ...]
     sizes: tuple[float, ...]  # typical size of each number: what the solver counts in
+    words: tuple[tuple[str, ...], ...] = ()  # of each name; where empty, those between its spaces
 
 
 class Free(NamedTuple):
@@ -155,15 +156,20 @@ def _only(part: Part, places: Any) -> Part:
         keep = [k for k, i in enumerate(part.index) if flat[i]]
     else:
         wanted = [places] if isinstance(places, str) else list(places)
-        words = [set(_words(name)) for name in part.names]
-        keep = [k for k, own in enumerate(words) if any(set(w.split()) <= own for w in wanted)]
+        words = part.words or [tuple(name.split()) for name in part.names]
+        keep = [k for k, own in enumerate(words) if any(_said(place, own) for place in wanted)]
     index, sizes = tuple(part.index[k] for k in keep), tuple(part.sizes[k] for k in keep)
     names, units = (tuple(x[k] for k in keep) for x in (part.names, part.units))
-    return Part(part.kind, part.key, index, part.shape, names, units, sizes)
+    words = tuple(part.words[k] for k in keep) if part.words else ()
+    return Part(part.kind, part.key, index, part.shape, names, units, sizes, words)
 
 
-def _words(name: str) -> list[str]:
-    return name.split()
+def _said(place: str, words: Sequence[str]) -> bool:
+    """Whether a place is said by words of a name alone; names of links and joints may hold spaces."""
+    rest = f" {' '.join(place.split())} "
+    for word in sorted(filter(None, words), key=len, reverse=True):
+        rest = rest.replace(f" {' '.join(word.split())} ", " ")
+    return not rest.strip()
 
 
 def _parts(kind: str, model: ExtendedModel, data: Sequence[Data]) -> Iterator[Part]:
@@ -193,10 +199,11 @@ def _parts(kind: str, model: ExtendedModel, data: Sequence[Data]) -> Iterator[Pa
 
 
 def _part(kind: str, places: Sequence[str], words: Sequence[str], units: Sequence[str], sizes: Any) -> Part:
-    names = [" ".join(x for x in (kind, place, word) if x) for place in places for word in words]
+    own = tuple(tuple(x for x in (kind, place, word) if x) for place in places for word in words)
+    names = [" ".join(one) for one in own]
     shape = (len(places), len(words)) if places != ("",) else (len(words),)
     flat = tuple(np.asarray(sizes, float).reshape(-1).tolist())
-    return Part(kind, (), tuple(range(len(names))), shape, tuple(names), tuple(units) * len(places), flat)
+    return Part(kind, (), tuple(range(len(names))), shape, tuple(names), tuple(units) * len(places), flat, own)
 
 
 def _inertia_sizes(robot: RobotModel) -> np.ndarray:
@@ -237,8 +244,9 @@ def _effect_parts(model: ExtendedModel, friction: bool) -> Iterator[Part]:
         for name, parameter in effect.parameters().items():
             if parameter.choice:
                 continue
-            word = " ".join([effect.name, *places, name])
-            yield Part("effect", (k, name), (0,), (), (word,), (parameter.unit,), (_effect_size(effect, name),))
+            words = (effect.name, *places, name)
+            size = _effect_size(effect, name)
+            yield Part("effect", (k, name), (0,), (), (" ".join(words),), (parameter.unit,), (size,), (words,))
 
 
 def _effect_size(effect: Effect, name: str) -> float:

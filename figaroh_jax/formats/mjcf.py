@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import InputError
+from ..errors import InputError, check_names
 from ..rigid import inertia
 from ..rigid.model import Kind, RobotModel
 from .assembly import (
@@ -214,6 +214,7 @@ def compiled_robot(
     root: Root | None = None,
 ) -> RobotModel:
     """Model of a compiled `mujoco.MjModel`; `source` names it in messages. See `load_mjcf`."""
+    check_names("joints", joints)
     try:
         with np.errstate(all="ignore"):  # `assemble` checks what comes of it
             links, parts, frames = mjcf_parts(mj, root)

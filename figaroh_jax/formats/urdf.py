@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import InputError, nearest
+from ..errors import InputError, check_names, nearest
 from ..rigid import inertia
 from ..rigid.model import Kind, RobotModel
 from .assembly import JointPart, LinkPart, Posture, Root, assemble, refuse_many
@@ -85,6 +85,7 @@ def load_urdf(
     >>> fj.load_urdf(fj.DEMO).joint_names
     ('waist', 'shoulder', 'elbow', 'wrist')
     """
+    check_names("joints", joints)
     path = find_in_packages(path, packages)
     name, parts = urdf_parts(path)
     return assemble(str(path), name, parts, joints, posture, gravity, root)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import InputError
+from ..errors import InputError, check_names
 from ..rigid import inertia
 from ..rigid.model import RobotModel
 from .assembly import ROOT_JOINT, FramePart, JointPart, LinkPart, Posture, Root, assemble, displacement, translation
@@ -69,6 +69,7 @@ def load_usd(
     ...     fj.load_usd(f"{folder}/arm.usda", root="fixed").joint_names
     ('hinge',)
     """
+    check_names("joints", joints)
     file = find_in_packages(path, packages)
     with reading(file):
         stage = Stage(file)

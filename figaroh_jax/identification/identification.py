@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from ..effects.base import Effect
 from ..effects.friction import CoulombFriction
 from ..effects.plausibility import implausible
-from ..errors import InputError, check_list, nearest
+from ..errors import InputError, check_list, check_names, nearest
 from ..estimation.base_parameters import BaseParameters, base_parameters, essential
 from ..estimation.columns import friction_terms, structural_columns
 from ..estimation.conic import Body, NotConverged
@@ -32,7 +32,7 @@ from ..recordings.bandwidth import note_on
 from ..recordings.checks import check_recordings
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Resampled, Signals, as_slow_as_torque, kept_out_in_vain, prepare_all
-from ..rigid.model import RobotModel, prismatic
+from ..rigid.model import DOF_NAMES, RobotModel, prismatic
 from ..simulators.contract import Backend
 from ..simulators.native import as_backend
 from ..simulators.registry import backend as make_backend
@@ -321,10 +321,12 @@ def _refused(
 ) -> tuple[frozenset[str], list[str]]:
     """Joints whose torque is not fitted: not asked for, or standing at one value most of the time."""
     names = model.dof_names
+    check_names("joints", joints)
     for name in joints or ():
         if name not in {*names, *model.joint_names}:
             raise InputError(f"identify.joints: no moving joint '{name}'{nearest(name, (*model.joint_names, *names))}")
-    asked = {name for name in names if joints is None or name in joints or name.split(".")[0] in joints}
+    owner = {f"{joint.name}{part}": joint.name for joint in model.joints for part in DOF_NAMES[joint.kind]}
+    asked = {name for name in names if joints is None or name in joints or owner[name] in joints}
     refused = set(names) - asked
     notes = [f"torque of {name} is not fitted: not among identify.joints" for name in names if name in refused]
     for j, name in enumerate(names):

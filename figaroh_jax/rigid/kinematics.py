@@ -274,8 +274,10 @@ def states(model: RobotModel, **arrays: Float[ArrayLike, "..."]) -> list[Float[A
 def check_shapes(model: RobotModel, **arrays: Float[ArrayLike, "..."]) -> None:
     """Raise `InputError` naming the array (`q=`, `v=`, ...) that is not real or does not fit the model or the first.
 
-    The last axis of `q` holds the model's `nq` numbers, with unit quaternions; that of every other its `nv`.
+    The last axis of `q` holds the model's `nq` numbers, with unit quaternions; that of every other its `nv`. Raises
+    too where the model is something else.
     """
+    _check_model(model)
     first = next(iter(arrays))
     for name, array in arrays.items():
         check_real(name, array)
@@ -290,6 +292,24 @@ def check_shapes(model: RobotModel, **arrays: Float[ArrayLike, "..."]) -> None:
             raise InputError(f"{name} has shape {shape}, but {first} has {expected}; give both alike")
     if model.nq > model.nv and "q" in arrays and not traced(arrays["q"]):
         _check_quaternions(model, np.asarray(arrays["q"]))
+
+
+def _check_model(model: Any) -> None:
+    if isinstance(model, RobotModel):
+        return
+    if isinstance(getattr(model, "robot", None), RobotModel):
+        own = f"the {type(model).__name__} holds one: give its `.robot`, or call what it can do itself"
+    else:
+        own = "load_urdf, load_mjcf or load_usd read one from a file"
+    told = f"the text '{str(model)[:100]}'" if isinstance(model, str) else f"of type {type(model).__name__}"
+    raise InputError(f"model is {told}; a RobotModel is expected: {own}")
+
+
+def _frame_index(model: RobotModel, name: str) -> int:
+    _check_model(model)
+    if not isinstance(name, str):
+        raise InputError(f"name is of type {type(name).__name__}; the name of a frame is expected: (model, q, name)")
+    return model.frame_index(name)
 
 
 def _check_quaternions(model: RobotModel, q: np.ndarray) -> None:
@@ -358,7 +378,7 @@ def frame_placement(model: RobotModel, q: Float[ArrayLike, "*batch nq"], name: s
     >>> fj.frame_placement(robot, np.zeros(robot.nv), "hand").shape
     (4, 4)
     """
-    index = model.frame_index(name)
+    index = _frame_index(model, name)
     check_shapes(model, q=q)
     return over_samples(_one_frame, (model, index, model.frames[index].parent), q)
 
@@ -404,7 +424,7 @@ def frame_jacobian(
     >>> fj.frame_jacobian(robot, np.zeros(robot.nv), "hand", "local").shape
     (6, 4)
     """
-    index = model.frame_index(name)
+    index = _frame_index(model, name)
     if reference not in _JACOBIANS:
         raise InputError(f"reference is '{reference}'; known: {', '.join(_JACOBIANS)}")
     check_shapes(model, q=q)

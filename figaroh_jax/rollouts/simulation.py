@@ -40,7 +40,8 @@ def rollout(
     Row k holds over the step from k dt to (k + 1) dt, k >= 0; drives with a delay see it later, by the mean over the
     step of what was held `delay` before. Position, velocity and reading k are those at k dt, before that step. Forward
     and reverse mode work: `jax.grad` of a loss over the readings, `jax.jvp`, `jax.vmap`. Raises `InputError` where the
-    shapes do not fit and, outside of `jit`, where the motion diverges, with the joint and the step.
+    shapes do not fit and, outside of `jit`, where the motion diverges, with the joint and the step, or a number that it
+    depends on is not finite.
 
     >>> import numpy as np, figaroh_jax as fj
     >>> loop, _ = fj.load_loop(fj.DEMO, {"elbow": {"kind": "position", "kp": 20.0, "kd": 0.5}}, joints=["elbow"])
@@ -58,13 +59,20 @@ def rollout(
         q, v = (jnp.asarray(x, jnp.float64) for x in (position, velocity))
         found = _rollout(loop, u, q, v)
         if not traced(found.reading):
-            _refuse_divergence(loop, found)
+            _refuse_divergence(loop, found, command=u, position=q, velocity=v)
         return found
 
 
-def _refuse_divergence(loop: Loop, found: Rollout) -> None:
+def _refuse_divergence(loop: Loop, found: Rollout, **given: Array) -> None:
     wrong = np.argwhere(~(np.abs(np.asarray(found.velocity)) < 1e6))
     if len(wrong):
+        for name, array in given.items():
+            for at in np.argwhere(~np.isfinite(np.asarray(array)))[:1]:
+                row, places = f"row {at[0]}, " * (len(at) > 1), loop.robot.dof_names
+                if name == "command":
+                    places = loop.drives.names
+                where = places[at[-1]] if len(places) == array.shape[-1] else f"number {at[-1]}"
+                raise InputError(f"{name}, {row}{where}: {np.asarray(array)[tuple(at)]}; finite numbers are expected")
         row, column = wrong[0]
         raise InputError(
             f"the simulation diverges at joint {loop.robot.dof_names[column]}, {row * float(loop.dt):.4g} s"
