@@ -12,6 +12,8 @@ import pytest
 import yaml
 
 import figaroh_jax as fj
+from figaroh_jax.reporting.rollout_report import show_rollouts
+from figaroh_jax.rollouts.identification import identify_rollout_task
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -86,3 +88,22 @@ def test_a_torque_that_grows_with_time_is_no_link(tmp_path: Path) -> None:
     found = answered(tmp_path, recorded(tmp_path, seed, pushed=0.04))
     assert found.verdict == "unknown", (seed, found.causes)
     assert "time" in [part.kind for part in found.rest.parts if part.at == ("lift",)], seed
+
+
+@pytest.mark.parametrize("share", [1.0, 0.8])
+def test_numbers_beside_a_gain_that_is_off_are_not_told_without_a_word(
+    share: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def softer(model: Any) -> None:
+        model.actuator_gainprm[1, 0], model.actuator_biasprm[1, 1] = 40 * share, -40 * share
+
+    task = recorded(tmp_path, secrets.randbits(32), softer)
+    gain = {"effects": [{"effect": "actuator_gain", "at": ["lift"]}]}
+    for baseline in ({}, {"baseline": gain}):
+        (tmp_path / "task.yaml").write_text(yaml.safe_dump(task | {"actuator": {"gains": "known"}} | baseline))
+        found = identify_rollout_task(fj.load_task(tmp_path / "task.yaml"))
+        show_rollouts(found, "servo")
+        said = " ".join(capsys.readouterr().out.split())
+        assert ("or the gain of a drive is off" in said) == (share < 1 and not baseline)
+        damping = {one["expression"]: one["value"] for one in found.result["base_parameters"]}["damping lift"]
+        assert (abs(damping - 0.4) > 0.1) == (share < 1 and not baseline)

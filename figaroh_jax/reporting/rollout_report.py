@@ -78,7 +78,10 @@ def write_rollouts(found: RolloutIdentification, path: Path, title: str) -> None
 
 
 def show_rollouts(found: RolloutIdentification, robot: str, *, verbose: bool = False) -> None:
-    """Print the summary on standard output: the error first, then every number with its interval."""
+    """Print the summary on standard output: the error first, then every number with its interval.
+
+    The notes are counted, but for the one that the numbers are not to be believed; `verbose` shows them.
+    """
     sizes = {_title(one): (_interval(one), one["status"]) for one in _parameters(found)}
     name = max(map(len, [*sizes, _HEAD, *found.joints]))
     width = max((len(text) for text, _ in sizes.values()), default=0)
@@ -93,10 +96,11 @@ def show_rollouts(found: RolloutIdentification, robot: str, *, verbose: bool = F
         for q in _qualities(found)
     ]
     notes = found.result["notes"]
-    shown = [f"Note: {note}" for note in notes] if verbose else []
-    if notes and not verbose:
-        count = f"{len(notes)} note{'s'[: len(notes) != 1]}"
-        shown = [f"{count} on the data: in the report, or with --verbose"]
+    counted = [note for note in notes if not verbose and not note.startswith("the fit leaves")]
+    shown = [f"Note: {note}" for note in notes if note not in counted]
+    if counted:
+        count = f"{len(counted)} note{'s'[: len(counted) != 1]}"
+        shown.append(f"{count} on the data: in the report, or with --verbose")
     print(wording.fitted("\n".join([*lines, "", *shown]).rstrip()), file=sys.stdout)
 
 

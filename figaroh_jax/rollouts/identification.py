@@ -169,7 +169,7 @@ def _result(
             "noise": here.spread.tolist(),
         },
         "holdout": {name: _held(here, run, read) for name, (run, read) in held.items()},
-        "notes": [*notes, *_left(here, rms), *_trades([names[free.index(k)] for k in told], correlation)],
+        "notes": [*notes, *_left(here, rms, first), *_trades([names[free.index(k)] for k in told], correlation)],
         "unit": "m" if all_slide(here.loop) else "rad",
     }
 
@@ -230,17 +230,26 @@ def _held(here: Setting, run: Run, read: np.ndarray) -> dict[str, list[Any]]:
     return {"rms": error.tolist(), "relative": shares, "r2": [None if x is None else 1 - x**2 for x in shares]}
 
 
-def _left(here: Setting, rms: np.ndarray) -> list[str]:
+def _left(here: Setting, rms: np.ndarray, first: Fit) -> list[str]:
     """Where the fit leaves much more than the encoders' noise, and what that means for the numbers beside it."""
     share = rms / np.maximum(here.spread, 1e-12)
     worst = int(np.argmax(share))
     if share[worst] < _NOT_NOISE:
         return []
-    joint = here.loop.robot.dof_names[here.loop.measured[worst]]
-    return [
+    at = here.loop.measured[worst]
+    joint = here.loop.robot.dof_names[at]
+    text = (
         f"the fit leaves {share[worst]:.0f} times the encoder's noise at {joint}: the loop lacks something, which"
         " `diagnose` looks for, and the intervals do not count it"
-    ]
+    )
+    fitted = {here.known.table[int(k)].name for k in first.free if k >= 0}
+    if np.asarray(here.loop.drives.transmission)[:, at].any() and "scale" not in fitted:
+        gain = f"{{effect: actuator_gain, at: [{joint}]}}"
+        text += (
+            "; or the gain of a drive is off: gains are taken as the model has them, and friction, damping and rotors"
+            f" follow one that is wrong. `baseline: {{effects: [{gain}]}}` fits it"
+        )
+    return [text]
 
 
 def _trades(names: list[str], correlation: np.ndarray) -> list[str]:
