@@ -166,6 +166,19 @@ def test_errors_of_a_camera_in_the_hand_are_no_joint_that_varies(folder: Path):
     assert found.noise[0] is not None and abs(found.noise[0] - 0.2) < 0.03
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-6])
+def test_an_offset_in_postures_of_a_simulation_is_named(noise: float, folder: Path):
+    """What a prior leaves beside so precise a device is a small share of a column, and no rounding."""
+    arm, rng = study().arm("arm6", folder), np.random.default_rng(5)
+    q = poses.postures(rng, 40)
+    wrong = np.eye(len(arm.joints))[2]
+    seen = [p * pin.SE3(pin.exp3(noise * rng.normal(size=3)), noise * rng.normal(size=3)) for p in
+            _exact(arm, q + 0.02 * wrong)]  # fmt: skip
+    run = postures_of(q=q, pose=np.array([s.homogeneous for s in seen]), base_frame=arm.base, tool_frame=arm.tool)
+    found = diagnose_poses(load_urdf(arm.path, joints=list(arm.joints)), [run])
+    assert [(c.name.effect, c.name.at) for c in found.causes] == [("joint_offset", (arm.joints[2],))]
+
+
 def _exact(arm: Any, q: np.ndarray) -> list[pin.SE3]:
     """Tool in the base frame, by the file."""
     data, base, tool = arm.robot.createData(), *(arm.robot.getFrameId(name) for name in (arm.base, arm.tool))
