@@ -372,7 +372,8 @@ def drawn(
     q, v, a = (x[::5] for x in _reference(rng, "waves", 8.0, 0.001, travel, moving, 0.8 * fast))
     rubbed = torque(q + start, v, a) + viscous * v + dry * np.sign(v)
     names = [robot.names[k] for k in moving]
-    ahead = Forward(names, *(x[:, moving] for x in (q + start, v, a, rubbed)), noise * load[moving])
+    q, v, a, rubbed = (x[:, moving] for x in (q + start, v, a, rubbed))
+    ahead = Forward(names, q, v, a, rubbed, noise * load[moving])
     return Case(told, task, {}, recordings, "npz", truth, {}), same, ahead
 
 
