@@ -62,6 +62,7 @@ def answered(folder: Path, task: dict[str, Any]) -> fj.Diagnosis:
     return found
 
 
+@pytest.mark.slow
 def test_a_gain_that_is_off_is_no_load(tmp_path: Path) -> None:
     """The gain of the lift is less than the file's: a load at its link does as much there, and moves the pan."""
     seed = secrets.randbits(32)

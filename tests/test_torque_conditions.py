@@ -50,7 +50,7 @@ def test_a_strangers_recording_gets_its_cause(seed: int, mark: str) -> None:
 @pytest.mark.parametrize(
     ("seed", "effects", "mark"),
     [
-        pytest.param(7073, [], "unknown", id="steps of an encoder that a gear's resonance filters out"),
+        pytest.param(7073, [], "nothing", id="steps of an encoder that a gear's resonance filters out"),
         pytest.param(31000, [], "nothing", id="a joint's position smoothed alone, for another's is abrupt"),
         pytest.param(50, [], "unknown", id="the same of five joints beside an error of an encoder"),
         pytest.param(9046, ["joint_elasticity"], "right", id="a gear that winds up"),
