@@ -17,11 +17,9 @@ from __future__ import annotations
 
 import argparse
 import collections
-import contextlib
-import io
 import json
+import sys
 import tempfile
-import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +27,8 @@ import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 import yaml
 
-from figaroh_jax.cli import main as command_line
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks.rollout_conditions import asked
 
 EFFECTS = ("nothing", "offset", "offsets", "link")
 KINDS = ("pose", "exact orientation", "position", "markers")
@@ -202,29 +201,17 @@ def drawn(chain: Chain, rng: np.random.Generator, args: argparse.Namespace) -> C
 
 def answered(case: Case, keep: Path | None) -> tuple[list[str], list[str]]:
     """How both commands did, in a word and in a line."""
-    marks, lines = [], []
     with tempfile.TemporaryDirectory() as name:
         folder = keep or Path(name)
         folder.mkdir(parents=True, exist_ok=True)
         np.savez(folder / "postures.npz", q=case.q, seen=case.seen)
         (folder / "task.yaml").write_text(yaml.safe_dump(case.task))
-        for job in ("calibrate", "diagnose"):
-            said = io.StringIO()
-            with (
-                contextlib.redirect_stdout(said),
-                contextlib.redirect_stderr(said),
-                warnings.catch_warnings(record=True) as noted,
-            ):
-                warnings.simplefilter("always")
-                status = command_line([job, str(folder / "task.yaml"), "--out", str(folder / job), "--quiet"])
-            if status:
-                marks.append("error")
-                lines.append(f"{job}: {status} {' '.join(said.getvalue().split())[-300:]}")
-                continue
+
+        def judged(job: str) -> tuple[str, str]:
             mark, line = (calibrated if job == "calibrate" else named)(case, folder / job)
-            marks.append("warning" if noted else mark)
-            lines.append(f"{job}: {mark}: {line}" + "".join(f"; {one.message}" for one in noted[:1]))
-    return marks, lines
+            return mark, f"{mark}: {line}"
+
+        return asked(folder, ["calibrate", "diagnose"], judged)
 
 
 def calibrated(case: Case, run: Path) -> tuple[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import pickle
 import zipfile
@@ -13,7 +14,10 @@ import numpy as np
 import pytest
 from tasks import URDF, arrays, task, write
 
+import figaroh_jax as fj
 from figaroh_jax.cli import main
+from figaroh_jax.diagnosis.diagnosis import _refuse_unmeasured
+from figaroh_jax.errors import InputError
 
 Spoil = Callable[[Path], Any]  # takes the folder of a right task and makes it wrong
 
@@ -331,3 +335,14 @@ def test_wrong_input_is_refused_with_the_culprit_named(tmp_path, capsys, spoil, 
 
 def test_there_are_enough_cases():
     assert len(CASES) >= 45
+
+
+def test_a_joint_that_rests_in_one_recording_is_no_reason_to_refuse_the_others() -> None:
+    """Its torque may have one value there, as a coarse sensor has it; in all of them it was not measured."""
+    robot = fj.load_urdf(fj.DEMO)
+    q, tau = np.random.default_rng(0).standard_normal((2, 50, 4))
+    moved = [fj.recording(q=q, tau=tau, rate=100) for _ in range(2)]
+    dead = [dataclasses.replace(one, torque=tau * [1, 1, 1, 0] + 0.3) for one in moved]
+    _refuse_unmeasured(robot, [dead[0], moved[1]])
+    with pytest.raises(InputError, match=r"torque of wrist is 0\.3 in every row"):
+        _refuse_unmeasured(robot, dead)

@@ -171,20 +171,21 @@ class _Judged(NamedTuple):
 
 
 def _refuse_unmeasured(robot: RobotModel, recordings: Sequence[Recording]) -> None:
-    """Refuse a joint whose torque has one value in a recording of the fit: every joint is judged by its torque."""
-    for one in recordings:
-        if one.role != "fit" or one.torque is None:
-            continue
-        dead = np.flatnonzero(np.ptp(one.torque, axis=0) == 0)
-        if 0 < dead.size < one.torque.shape[1]:  # of all joints: `check_recordings` says so
-            j = int(dead[0])
-            name, still = robot.dof_names[j], np.ptp(one.position[:, j]) == 0
-            instead = "identify leaves such a joint out, a diagnosis judges every joint by its torque"
-            if still:
-                instead = f"it stands still: name the others in robot.joints, and {name} in robot.posture"
-            raise InputError(
-                f"{one.file}: the torque of {name} is {one.torque[0, j]:g} in every row: it was not measured; {instead}"
-            )
+    """Refuse a joint whose torque has one value in all recordings of the fit: every joint is judged by its torque."""
+    fitted = [one for one in recordings if one.role == "fit" and one.torque is not None]
+    if not fitted:
+        return
+    torque = np.concatenate([one.torque for one in fitted if one.torque is not None])
+    dead = np.flatnonzero(np.ptp(torque, axis=0) == 0)
+    if 0 < dead.size < torque.shape[1]:  # of all joints: `check_recordings` says so
+        j = int(dead[0])
+        name, still = robot.dof_names[j], all(np.ptp(one.position[:, j]) == 0 for one in fitted)
+        instead = "identify leaves such a joint out, a diagnosis judges every joint by its torque"
+        if still:
+            instead = f"it stands still: name the others in robot.joints, and {name} in robot.posture"
+        raise InputError(
+            f"{fitted[0].file}: the torque of {name} is {torque[0, j]:g} in every row: it was not measured; {instead}"
+        )
 
 
 def _searched(

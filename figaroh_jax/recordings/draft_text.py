@@ -16,6 +16,7 @@ __all__ = ["baseline_said", "clock_said", "locked_said", "task_text", "unit_said
 
 
 def clock_said(reads: Sequence[Columns]) -> Iterator[str]:
+    """The rate, the stamps' unit and the length of each recording."""
     for read in reads:
         rate = (len(read.time) - 1) / (read.time[-1] - read.time[0])
         unit = read.entry.get("units", {}).get("time", "s")
@@ -30,6 +31,7 @@ def locked_said(robot: RobotModel, whole: RobotModel) -> list[str]:
 
 
 def unit_said(unit: str, robot: RobotModel, reads: Sequence[Columns], stated: bool) -> str:
+    """The unit of the positions, and by what it is known."""
     straight = prismatic(robot)
     plain = "m" if all(straight) else "rad and m" if any(straight) else "rad"
     text = {"rad": plain, "deg": "degrees", "mm": "mm"}[unit]
