@@ -124,6 +124,9 @@ def grade(task_text: str, assumed: tuple[str, ...], case: Case, folder: Path) ->
     (recording,) = read_recordings(task, load_robot(task), rollouts=rollouts)
     order = [case.joints.index(name) for name in recording.joints]
     q, tau = case.arrays["q"][:, order], case.arrays["tau"][:, order]
+    if recording.stamps is not None and len(q) > 1:  # rows that were left out, told by their stamps
+        kept = np.isin(recording.stamps, recording.time)
+        q, tau = q[kept], tau[kept]
     off = np.abs(recording.position - q).max(axis=0) > 1e-6
     if not rollouts:
         assert recording.torque is not None
