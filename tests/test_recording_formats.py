@@ -451,6 +451,15 @@ def test_numbers_without_a_header_are_columns_by_number(tmp_path: Path):
     np.testing.assert_array_equal(table.read("column_2"), [1, 4, 7, 10])
 
 
+@pytest.mark.parametrize("head", ["image,x,q1\n", "# image,x,q1\n"])
+def test_an_example_row_in_the_comments_is_neither_names_nor_numbers(head: str, tmp_path: Path):
+    rows = "".join(f"images/{k}.png,{k}.25,-{k}\n" for k in range(1, 9))
+    (tmp_path / "run.csv").write_text(f"# one row an image\n# images/0.png,7.5,8.5\n{head}{rows}")
+    table = read_table(tmp_path / "run.csv", "data")
+    assert table.names == ("image", "x", "q1")
+    np.testing.assert_array_equal(table.read("q1"), -np.arange(1.0, 9.0))
+
+
 def test_long_files_are_read_in_blocks_and_tell_how_far(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("figaroh_jax.recordings.textfiles._BLOCK", 1000)
     rows = np.random.default_rng(1).normal(size=(500, 3))

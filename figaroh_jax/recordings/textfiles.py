@@ -74,13 +74,15 @@ def _layout(file: Path) -> _Layout:
     delimiter = _delimiter(lines)
     rows = [_cells(line, delimiter) for line in lines]
     decimal = _decimal(rows)
-    first = next((k for k, row in enumerate(rows) if _is_data(row, decimal)), None)
+    data = [_is_data(row, decimal) for row in rows]
+    notes = [k for k, line in enumerate(lines) if data[k] and line.lstrip()[:1] in ("#", "%")]  # a row in a comment
+    first = next((k for k, numbers in enumerate(data) if numbers and k not in notes), None)
     if first is None:
         if len(lines) < 2:
             raise InputError(f"{file} is not a table of numbers with a header line: it has {len(lines)} line(s)")
         first = 1  # names and rows of text: each column says what is wrong with it once it is asked for
     width = len(rows[first])
-    heads = [k for k in range(first) if len(rows[k]) == width and lines[k].strip()]
+    heads = [k for k in range(first) if len(rows[k]) == width and lines[k].strip() and k not in notes]
     if not heads:
         if first:
             raise InputError(
