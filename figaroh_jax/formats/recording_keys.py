@@ -29,6 +29,7 @@ class Units(Keys):
     velocity: Literal["rad/s", "deg/s", "m/s", "mm/s"] | None = None  # None: as the position
     torque: Literal["N m", "Nm", "N", "A", "mA", "%"] = "N m"  # A, mA, %: transmission.torque is N m an A, N m a %
     measurement: Literal["m", "mm"] = "m"
+    orientation: Literal["rad", "deg"] = "rad"  # of rpy and rotvec
 
 
 class Accuracy(Keys):
@@ -55,6 +56,7 @@ class Measurement(Keys):
     accuracy: Accuracy = Accuracy()
     distance: Positive | None = None  # m between two sockets
     mount: Literal["hand", "world"] | None = None  # of the camera
+    orientation: Literal["xyzw", "wxyz", "rpy", "rotvec"] | None = None  # of a pose that is no matrix; None: xyzw
 
     @property
     def kind(self) -> str:
@@ -72,6 +74,8 @@ class Measurement(Keys):
             raise ValueError("distance belongs to the kind socket")
         if (self.mount is not None) != (kinds == ["camera"]):
             raise ValueError("the kind camera, and only it, needs mount: hand or world")
+        if self.orientation is not None and kinds not in (["pose"], ["camera"]):
+            raise ValueError("orientation belongs to the kinds pose and camera")
         return self
 
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["PoseRecording", "points", "poses", "read_pose_recordings", "whole_numbers"]
 
 _LOOSE = 1e-2  # how far a rotation or a quaternion may be off by rounding
+_MOST_ANGLE = 6.5  # rad, of an orientation: a turn and a little
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,7 @@ def _read(task: Task, entry: RecordingEntry, key: str, model: RobotModel, drive:
     measurement = entry.measurement
     base, tool, unknown, notes = _frames(task, measurement, f"{key}.measurement", model)
     scale = 1e-3 if entry.units.measurement == "mm" else 1.0
-    kind, values = _values(table, measurement, f"{key}.measurement", len(position), scale)
+    kind, values = _values(table, entry, f"{key}.measurement", len(position), scale)
     accuracy = measurement.accuracy
     return PoseRecording(
         name=entry.name,
@@ -141,7 +142,9 @@ def _time(table: Table, entry: RecordingEntry, key: str, samples: int) -> Float[
     return dataset.read_time(table, entry, key, samples)
 
 
-def _values(table: Table, measurement: Measurement, key: str, samples: int, scale: float):
+def _values(table: Table, entry: RecordingEntry, key: str, samples: int, scale: float):
+    measurement = entry.measurement
+    assert measurement is not None
     kind = measurement.kind
     source = getattr(measurement, kind)
     where = f"{key}.{kind}"
@@ -149,7 +152,7 @@ def _values(table: Table, measurement: Measurement, key: str, samples: int, scal
         return kind, _numbers(table, source, where, samples)
     values = _array(table, source, where)
     if len(values) != samples:
-        wanted = "(postures, 3)" if kind == "position" else "(postures, 4, 4) or (postures, 7)"
+        wanted = "(postures, 3)" if kind == "position" else "(postures, 4, 4), (postures, 7) or (postures, 6)"
         shape, stacked = np.shape(values), kind != "position" and len(values) == 4 * samples
         why = ": its matrices are stacked below each other" if stacked else ""
         why = why or (": the postures stand on its last axis" if shape[-1] in (samples, 4 * samples) else "")
@@ -159,6 +162,9 @@ def _values(table: Table, measurement: Measurement, key: str, samples: int, scal
         )
     if kind == "position":
         return kind, points(values, table, where) * scale
+    if measurement.orientation is not None or values.shape[1:] == (6,):
+        degrees = entry.units.orientation == "deg"
+        values = _with_quaternions(values, measurement.orientation, degrees, table, where)
     found = poses(values, table, where)
     found[:, :3, 3] *= scale
     if carried(kind, measurement.mount):  # the board stands still: the camera's pose seen from it
@@ -189,6 +195,41 @@ def points(values: np.ndarray, table: Any, key: str) -> np.ndarray:
         marker = int(np.argmin(np.isfinite(values).all(axis=2).any(axis=0)))
         raise InputError(f"{table.file}: {key}: marker {marker} (from 0) was not measured in any posture")
     return values
+
+
+def _with_quaternions(
+    values: np.ndarray, orientation: str | None, degrees: bool, table: Table, key: str
+) -> Float[np.ndarray, "postures 7"]:
+    """Poses x y z qx qy qz qw of rows whose orientation is written in another way (`Measurement.orientation`)."""
+    from scipy.spatial.transform import Rotation
+
+    angles = orientation in ("rpy", "rotvec")
+    if values.ndim != 2 or values.shape[1] not in (6, 7):
+        raise InputError(f"{table.file}: {key} has shape {values.shape}; matrices need no `orientation`")
+    if values.shape[1] == 6 and not angles:
+        raise InputError(
+            f"{table.file}: {key} has six numbers a posture: add `orientation: rpy` (roll, pitch and yaw about fixed x,"
+            " y and z) or `orientation: rotvec` (axis times angle) to the measurement, and units: {orientation: deg}"
+            " where they are degrees"
+        )
+    if values.shape[1] == 7 and angles:
+        raise InputError(f"{table.file}: {key} has seven numbers a posture; `orientation: {orientation}` has six")
+    if values.shape[1] == 7:
+        return values[:, [0, 1, 2, 4, 5, 6, 3]] if orientation == "wxyz" else values
+    _whole_or_missing(values[:, None, 3:], table, key, "orientation")
+    seen = np.isfinite(values[:, 3:]).all(axis=1)
+    turned = np.radians(values[seen, 3:]) if degrees else values[seen, 3:]
+    if np.abs(turned).max(initial=0.0) > _MOST_ANGLE:
+        raise InputError(
+            f"{table.file}: {key} has angles up to {np.abs(values[seen, 3:]).max():.4g} rad: are they degrees? add"
+            " units: {orientation: deg}"
+        )
+    found = np.full((len(values), 7), np.nan)
+    found[:, :3] = values[:, :3]
+    if len(turned):
+        rotation = Rotation.from_euler("xyz", turned) if orientation == "rpy" else Rotation.from_rotvec(turned)
+        found[seen, 3:] = rotation.as_quat()
+    return found
 
 
 def _whole_or_missing(values: np.ndarray, table: Any, key: str, what: str) -> None:
