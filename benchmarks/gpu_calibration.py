@@ -24,8 +24,9 @@ import jax
 import numpy as np
 
 from figaroh_jax.calibration.gauge import find_gauge
-from figaroh_jax.estimation import posefit, starts
+from figaroh_jax.estimation import posefit
 from figaroh_jax.estimation.posesolver import solve
+from figaroh_jax.recordings import starts
 from figaroh_jax.recordings.devices import Poses
 from figaroh_jax.rigid.chain import Chain
 

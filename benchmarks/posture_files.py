@@ -10,6 +10,9 @@ zeroed wrongly, or all of them, or a link is off.
 `calibration.yaml` are added, and the measured points are compared with those of the robot itself, without noise. It is
 `off` where the error is more than twice what `calibrate` says of postures left out, and `worse` where it is beyond that
 of frames alone. `diagnose` is `wrong` with a name at another place than the truth or its neighbours.
+`--draft` asks `new` alone, of files as strangers write them: arrays or columns in any order and unit, matrices, points,
+quaternions or angles, boards seen from the hand. `right`: it reads what was written, on the body that carries the
+marker; `wrong`: other numbers.
 One line a case; at the end tables, and every case that is not as it should be.
 """
 
@@ -26,6 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 import yaml
+from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.rollout_conditions import asked
@@ -84,6 +88,7 @@ def main() -> None:
     parser.add_argument("--effects", nargs="+", choices=EFFECTS, default=["nothing", *EFFECTS])
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=["pose", "position", "markers"])
     parser.add_argument("--noise", nargs="+", type=float, default=[1e-5, 1e-4, 5e-4], help="m and rad")
+    parser.add_argument("--draft", action="store_true", help="`new` alone")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="leave the cases and their runs there")
     args = parser.parse_args()
     files = [f for folder in args.folders for f in sorted(folder.rglob("*.urdf"))]
@@ -95,6 +100,12 @@ def main() -> None:
         while chain is None:
             chain = read(files[int(rng.integers(len(files)))], rng)
         case = drawn(chain, rng, args)
+        if args.draft:
+            mark, line = drafted(case, rng)
+            print(f"{seed}: {line}", flush=True)
+            count["new", mark] += 1
+            odd += [f"{seed}: {line}"] if mark == "wrong" else []
+            continue
         marks, lines = answered(case, args.keep and args.keep / str(seed))
         line = f"{seed}: {case.told}\n    " + "\n    ".join(lines)
         print(line, flush=True)
@@ -197,6 +208,79 @@ def drawn(chain: Chain, rng: np.random.Generator, args: argparse.Namespace) -> C
     )
     own = MARKERS if "pose" in measurement else None
     return Case(told, effect, chain, truth, noise, task, q[:, order], seen, fresh, points, own)
+
+
+def drafted(case: Case, rng: np.random.Generator) -> tuple[str, str]:
+    """How `new` reads a case's postures, written in one of the ways of strangers; a mark and a line."""
+    from figaroh_jax.errors import InputError
+    from figaroh_jax.formats.config import load_task
+    from figaroh_jax.formats.robotfile import load_robot
+    from figaroh_jax.recordings.draft import draft_task
+    from figaroh_jax.recordings.poses import read_pose_recordings
+
+    joints = case.task["robot"]["joints"]
+    model = case.chain.model
+    turns = np.array([model.joints[model.getJointId(name)].shortname().startswith("JointModelR") for name in joints])
+    angle, length = (str(rng.choice(units)) for units in (("rad", "deg"), ("m", "mm")))
+    q = np.where(turns, np.rad2deg(case.q), case.q) if angle == "deg" else case.q
+    posed, inverse, table = (
+        case.seen.ndim == 3 and case.seen.shape[1:] == (4, 4),
+        rng.random() < 0.5,
+        rng.random() < 0.5,
+    )
+    columns, arrays, way = {name: q[:, k] for k, name in enumerate(joints)}, {"q": q}, "points"
+    scale = 1e3 if length == "mm" else 1.0
+    if posed:
+        seen = np.linalg.inv(case.seen) if inverse else case.seen.copy()
+        seen[:, :3, 3] *= scale
+        rotation, place = Rotation.from_matrix(seen[:, :3, :3]), seen[:, :3, 3]
+        way = str(rng.choice(["matrices", "quaternions", "w first", "rpy", "rotvec"]))
+        quaternion = rotation.as_quat()
+        rows = {
+            "quaternions": quaternion,
+            "w first": quaternion[:, [3, 0, 1, 2]],
+            "rpy": rotation.as_euler("xyz", degrees=angle == "deg"),
+            "rotvec": rotation.as_rotvec(degrees=angle == "deg"),
+        }
+        names = {"w first": ("qw", "qx", "qy", "qz"), "rpy": ("roll", "pitch", "yaw"), "rotvec": ("rx", "ry", "rz")}
+        told = rows.get(way, quaternion)
+        arrays["pose"] = seen if way == "matrices" else np.concatenate([place, told], axis=1)
+        columns |= dict(zip(("x", "y", "z"), place.T, strict=True))
+        columns |= dict(zip(names.get(way, ("qx", "qy", "qz", "qw")), told.T, strict=True))
+    else:
+        points = scale * case.seen.reshape(len(q), -1)
+        arrays["marker"] = points
+        columns |= {
+            f"{axis}{k + 1}": points[:, 3 * k + j] for k in range(points.shape[1] // 3) for j, axis in enumerate("xyz")
+        }
+    written = f"{'a table' if table else 'arrays'}, {way}{' from the hand' * (posed and inverse)}, {angle}, {length}"
+    line = f"{case.told}, {written}: "
+    with tempfile.TemporaryDirectory() as name:
+        file = Path(name) / ("run.csv" if table else "run.npz")
+        if table:
+            order = [*columns]
+            rng.shuffle(order)
+            values = np.column_stack([columns[column] for column in order])
+            np.savetxt(file, values, "%.17g", ",", header=",".join(order), comments="")
+        else:
+            np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
+        try:
+            text = draft_task(case.chain.file, [file], joints=None if table else joints).text
+        except InputError as error:
+            return "refused", f"{line}refused: {str(error).splitlines()[0][-330:]}"
+        (Path(name) / "task.yaml").write_text(text)
+        task = load_task(Path(name) / "task.yaml")
+        robot = load_robot(task)
+        (read,) = read_pose_recordings(task, robot)
+    right = [joints.index(joint) for joint in robot.joint_names]
+    seen = case.seen if posed or case.seen.ndim == 3 else case.seen[:, None]
+    if read.position.shape != case.q.shape or not np.allclose(read.position, case.q[:, right], rtol=0, atol=1e-9):
+        return "wrong", f"{line}wrong positions"
+    if read.values.shape != seen.shape or not np.allclose(read.values, seen, rtol=0, atol=1e-6):
+        return "wrong", f"{line}wrong measurement"
+    carries = {frame.name: frame.parent for frame in robot.frames}
+    alike = carries[read.tool_frame] == carries[case.chain.frames[1]]
+    return ("right" if alike else "another body"), f"{line}{'right' if alike else f'on {read.tool_frame}'}"
 
 
 def answered(case: Case, keep: Path | None) -> tuple[list[str], list[str]]:

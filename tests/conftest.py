@@ -29,7 +29,8 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 @pytest.fixture(autouse=True)
 def own_effects() -> Iterator[None]:
     """Effects that a test registers are known to it alone: no later test of the same process meets them."""
-    import figaroh_jax.effects.catalogue  # noqa: F401  (what the library brings along stays)
+    import figaroh_jax.effects.catalogue
+    import figaroh_jax.effects.kinematic  # noqa: F401  (what the library brings along stays)
     from figaroh_jax.effects import registry
 
     tables = (registry.CATALOGUE, registry.POSES, registry.ROLLOUTS, registry._OTHERS)  # pyright: ignore[reportPrivateUsage]

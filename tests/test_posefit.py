@@ -13,10 +13,11 @@ import poses
 import pytest
 from jaxtyping import Array, Float
 
-from figaroh_jax.estimation import posefit, starts
+from figaroh_jax.estimation import posefit
 from figaroh_jax.estimation.posehost import HostRows, written_out
 from figaroh_jax.estimation.posesolver import solve
 from figaroh_jax.formats.urdf import load_urdf
+from figaroh_jax.recordings import starts
 from figaroh_jax.recordings.devices import ORIENTATION, Device, Distance, Planes, Points, Poses, Sockets, own_device
 from figaroh_jax.rigid import lie
 from figaroh_jax.rigid.chain import chain_between

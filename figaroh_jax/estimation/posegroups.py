@@ -16,12 +16,13 @@ from jaxtyping import Bool, Int
 
 from ..effects.kinematic import Column, Postures
 from ..errors import InputError
+from ..recordings import starts
 from ..recordings.devices import Device, Planes, Points, Poses, Sockets
 from ..recordings.poses import PoseRecording
 from ..rigid.chain import chain_between
 from ..rigid.kinematics import poses_on_host
 from ..rigid.model import RobotModel
-from . import posefit, starts
+from . import posefit
 from .gravity import gravity_moments
 
 __all__ = ["Measured", "assemble", "devices_of", "postures_of", "shared"]
@@ -147,8 +148,23 @@ def _device(model: RobotModel, recordings: list[PoseRecording]) -> tuple[Device,
     position = np.concatenate([r.position for r in recordings])
     R, p = _nominal(model, recordings[0].base_frame, recordings[0].tool_frame, position)
     fit = np.concatenate([np.full(len(r.position), r.role == "fit") for r in recordings])
+    if not fit.any():
+        _refuse_unplaced(recordings[0])
+        fit = np.ones(len(fit), bool)  # nothing is estimated from them: all is known
     make = {"position": _points, "pose": _poses, "socket": _sockets, "plane": _planes, "own": _own}
     return make[recordings[0].kind](recordings, R, p, fit)
+
+
+def _refuse_unplaced(recording: PoseRecording) -> None:
+    """`InputError` where a recording is predicted whose device no fitted recording shows."""
+    if recording.unknown or recording.kind in ("plane", "socket", "own"):
+        alike = "base_frame, tool_frame and unknown"
+        alike += f" and {recording.values.shape[1]} markers in a row" if recording.kind == "position" else ""
+        raise InputError(
+            f"{recording.file}: role: holdout, but nothing with role: fit is measured by the same device (a"
+            f" {recording.kind} with the same {alike}): where it stands and what it sees is not known, and nothing can"
+            " be predicted of it. Give it role: fit, or keep out a part of what the device measured"
+        )
 
 
 def _group(

@@ -7,6 +7,7 @@ can. What stays open is refused, what was assumed is said in the draft's comment
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,8 @@ from ..formats.robotfile import read_robot
 from ..rigid.model import DOF_NAMES, RobotModel, prismatic
 from .checks import DEGREE, Finding, check_recording, position_findings
 from .dataset import Driven, Recording
-from .draft_columns import Columns, Undecided, read_columns, without_sign
+from .draft_columns import Columns, Undecided, read_columns, read_tables, without_sign
+from .draft_postures import draft_postures, looks_measured
 from .draft_text import baseline_said, clock_said, locked_said, task_text, unit_said
 from .likeness import FEWEST, Sampled, likeness, rigid_torque, sampled
 from .torque_checks import TURNED_POSITION
@@ -66,7 +68,13 @@ def draft_task(
             raise InputError(f"--joints: robot '{whole.name}' has no joint '{name}'{nearest(name, whole.joint_names)}")
         if list(joints or ()).count(name) > 1:
             raise InputError(f"--joints: '{name}' is named twice")
-    reads = read_columns(files, whole, joints, rate, topic, drives if gains is None else lambda joints: ())
+    tables = read_tables(files, topic)
+    first = next(tables, None)
+    if first is None:
+        raise InputError("no recordings given")
+    if "format" not in first[1] and looks_measured(first[0], whole):
+        return Draft(*draft_postures(model, whole, [first[0], *(table for table, _ in tables)], joints, unit, folder))
+    reads = read_columns(chain([first], tables), whole, joints, rate, drives if gains is None else lambda joints: ())
     if len({read.joints for read in reads}) > 1:
         raise InputError("the recordings hold different joints; draft a task for each kind")
     robot = read_robot(model, reads[0].joints)

@@ -7,7 +7,7 @@ model. What names leave open is `Undecided`, with the option of the command that
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +21,19 @@ from .joined import in_halves
 from .reading import BAGS, kind_of, lerobot_episodes, read_table
 from .tables import Source, Table, leave_out, not_increasing
 
-__all__ = ["Columns", "Commands", "Undecided", "read_columns", "read_commands", "without_sign"]
+__all__ = [
+    "Columns",
+    "Commands",
+    "Undecided",
+    "column_kinds",
+    "holds",
+    "of_joints",
+    "read_columns",
+    "read_commands",
+    "read_tables",
+    "without_sign",
+    "words_of",
+]
 
 _WORDS = {
     "command": {
@@ -79,18 +91,20 @@ class Columns(NamedTuple):
 
 
 def read_columns(
-    files: Sequence[Path],
+    tables: Iterable[tuple[Table, dict[str, Any]]],
     model: RobotModel,
     joints: Sequence[str] | None = None,
     rate: float | None = None,
-    topic: str | None = None,
     drives: Callable[[Sequence[str]], Sequence[Driven]] = lambda joints: (),
 ) -> list[Columns]:
-    """The columns of every recording, in the joints' order of the model; `draft_task` says what may be given."""
-    return [_read(table, model, joints, rate, entry, drives) for table, entry in _tables(files, topic)]
+    """The columns of every recording, in the joints' order of the model; `draft_task` says what may be given.
+
+    `tables` are those of `read_tables`, each let go before the next is read.
+    """
+    return [_read(table, model, joints, rate, entry, drives) for table, entry in tables]
 
 
-def _tables(files: Sequence[Path], topic: str | None) -> Iterator[tuple[Table, dict[str, Any]]]:
+def read_tables(files: Sequence[Path], topic: str | None) -> Iterator[tuple[Table, dict[str, Any]]]:
     """Every recording with the keys of a task that say which it is; of a folder of episodes the first few."""
     for file in files:
         path = file.resolve()
@@ -126,17 +140,15 @@ def _read(
     drives: Callable[[Sequence[str]], Sequence[Driven]],
 ) -> Columns:
     form = entry.get("format")
-    if form is None:
-        _refuse_postures(table, model)
     clock = (_LOGGED[form]["time"] if form else _time(table)) if rate is None else None
-    kinds = _logged(table, _LOGGED[form]) if form else _kinds(table, clock)
+    kinds = _logged(table, _LOGGED[form]) if form else column_kinds(table, clock)
     if "position" not in kinds:
         raise InputError(
             f"{table.file}: no column looks like a position (q, pos, position, angle...); its columns are"
             f" {', '.join(table.names[:12])}{'...' if len(table.names) > 12 else ''}; rename those of the position, or"
             " write a task whose `position` names them"
         )
-    names, sources, named = _of_joints(table, kinds["position"], model, joints, "position")
+    names, sources, named = of_joints(table, kinds["position"], model, joints, "position")
     position = _matrix(table, sources, names, "position")
     if form is None or sources != _LOGGED[form]["position"]:
         entry = entry | {"position": sources}
@@ -149,7 +161,7 @@ def _read(
         if kind == "command":
             own, source, by_name = _of_driven(table, kinds[kind], names, tuple(known.values()))
         else:
-            own, source, by_name = _of_joints(table, kinds[kind], model, list(names), kind)
+            own, source, by_name = of_joints(table, kinds[kind], model, list(names), kind)
             if own != names:
                 raise InputError(f"{table.file}: {kind} is of {', '.join(own)}, position of {', '.join(names)}")
         values = _matrix(table, source, own, kind)
@@ -171,7 +183,7 @@ def _read(
     time, entry = _stamps(table, clock, rate, len(position), entry)
     if form is not None and rate is None:
         del entry["time"]
-    motor = bool(_MOTORS & set(_words(" ".join([sources] if isinstance(sources, str) else sources))))
+    motor = bool(_MOTORS & set(words_of(" ".join([sources] if isinstance(sources, str) else sources))))
     commands = (command, driven, drives_named)
     return Columns(table.file, entry, names, named, time, position, torque, current, *commands, unsigned, motor)
 
@@ -183,54 +195,6 @@ def without_sign(*torques: Float[np.ndarray, "samples joints"]) -> bool:
     """Whether no column ever changes its sign, and there are several."""
     low, high = np.min([x.min(axis=0) for x in torques], axis=0), np.max([x.max(axis=0) for x in torques], axis=0)
     return len(low) > 1 and bool(((low >= 0) | (high <= 0)).all())
-
-
-def _refuse_postures(table: Table, model: RobotModel) -> None:
-    """Measured postures are a task of `calibrate`, which needs frames that no file names: the message shows it."""
-    from ..formats.export import dump_yaml
-
-    kinds = _kinds(table, None)
-    measured = [n for n in table.names if _MEASURED.search(n) and not _holds_any(n, model.joint_names)]
-    if not measured or any(kind in kinds for kind in ("torque", "current", "command", "velocity")):
-        return
-    named = [n for n in table.names if n in model.joint_names]
-    whole = table.file.suffix.lower() in (".npz", ".mat", ".h5")
-    rest = [n for n in table.names if n not in measured]
-    columns = rest if not kinds.get("position") and len(rest) == len(model.joint_names) > 1 else ["JOINTS"]
-    columns = named or (kinds.get("position") or columns)[: 1 if whole else None]
-    position = columns if named or len(columns) > 1 else columns[0]
-    turned = [name for axis in "xyzw" for name in table.names if re.fullmatch(rf"q_?{axis}", name, re.IGNORECASE)]
-    if not whole and len(measured) == 3 and len(turned) == 4:
-        measured = [*measured, *turned]
-    shown = measured[0] if whole else measured[:12]
-    posed = "pose" in measured[0].lower() or measured[0].startswith("T_") or len(measured) == 7
-    kind = "pose" if posed else "position"
-    words = {word for name in (*columns, *measured) for word in _words(name)}
-    units = {key: unit for key, unit in (("position", "deg"), ("measurement", "mm")) if unit in words}
-    frames = {"base_frame": "BASE", "tool_frame": "TOOL", "unknown": ["base_frame", "tool_frame"]}
-    position = position if isinstance(position, str) else [*position]  # a copy, which YAML writes out
-    entry = {"file": table.file.name, "position": position, **({"units": units} if units else {})}
-    robot: dict[str, Any] = {"model": "MODEL"}
-    if named and named != list(model.joint_names):
-        robot["joints"] = [*named]
-    task = {"robot": robot, "data": [entry | {"measurement": {kind: shown, **frames}}]}
-    written = dump_yaml(task, line=True).strip()
-    raise InputError(
-        f"{table.file}: {', '.join(measured[:6])} look like measured poses or points. Postures are a task for"
-        " `calibrate`; `new` drafts motions only. The task is\n"
-        f"  {written}\n"
-        "where MODEL is the robot's file, and BASE and TOOL are frames of it; the measurement is a `pose`, `position`,"
-        " `plane`, `socket` or `camera`."
-    )
-
-
-_MEASURED = re.compile(
-    r"^(?:[xyz]\d*(?:[ _]?[\[(]?(?:mm|m)[\])]?)?|T_\w+|.*(?:pose|xyz|marker|point|board).*)$", re.IGNORECASE
-)
-
-
-def _holds_any(column: str, names: Sequence[str]) -> bool:
-    return any(_holds(column, name, names) for name in names)
 
 
 _LOGGED = {
@@ -248,11 +212,11 @@ def _logged(table: Table, known: dict[str, str]) -> dict[str, list[str]]:
 
 
 def _unit_of_current(source: Any) -> str:
-    words = set(_words(" ".join([source] if isinstance(source, str) else source)))
+    words = set(words_of(" ".join([source] if isinstance(source, str) else source)))
     return "%" if words & {"percent", "load"} else "mA" if "ma" in words else "A"
 
 
-def _words(name: str) -> list[str]:
+def words_of(name: str) -> list[str]:
     return [word for word in re.split(r"[^a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()) if word]
 
 
@@ -261,11 +225,11 @@ def _time(table: Table) -> str:
     found = [name for name in names if name.lower() in _TIMES] or [name for name in names if in_halves(name)]
     if not found and "received" in table.names:  # when a bag got a message that has no stamp of its own
         return "received"
-    found = found or [n for n in names if set(_words(n)) & {*_TIMES} and not set(_words(n)) & {"des", "cmd"}]
+    found = found or [n for n in names if set(words_of(n)) & {*_TIMES} and not set(words_of(n)) & {"des", "cmd"}]
     if not found and len(rising := _rising(table)) == 1:
         return rising[0]
     if len(found) != 1:
-        halves = [n for n in names if set(_words(n)) & _HALVES]
+        halves = [n for n in names if set(words_of(n)) & _HALVES]
         if halves and not found:
             raise Undecided(
                 "rate",
@@ -346,21 +310,21 @@ def _increasing(table: Table, clock: str, samples: int, of: str) -> Float[np.nda
     return time
 
 
-def _kinds(table: Table, clock: str | None) -> dict[str, list[str]]:
+def column_kinds(table: Table, clock: str | None) -> dict[str, list[str]]:
     """Columns or arrays by what their names say that they hold."""
     found: dict[str, list[str]] = {}
     for name in table.names:
-        words = set(_PRESENT.sub("", " ".join(_words(name))).split())
+        words = set(_PRESENT.sub("", " ".join(words_of(name))).split())
         kind = next((k for k, known in _WORDS.items() if known & words), None)
         kind = name.partition(".")[0] if name.partition(".")[0] in _OF_BAGS else kind
         told = name == clock or name in table.pieces or _has_parts(name, table.names)
         if not told and kind is not None and not _of_another_topic(name) and table.words(name) is None:
             found.setdefault("torque" if kind == "effort" else kind, []).append(name)
-    positions = [name for name in found.get("position", ()) if set(_words(name)) & _WORDS["position"] - {"state"}]
+    positions = [name for name in found.get("position", ()) if set(words_of(name)) & _WORDS["position"] - {"state"}]
     if positions and "position" in found:  # `state` is the mode of the controller there
         found["position"] = positions
     claimed = {name for names in found.values() for name in names} | {clock}
-    plain = [n for n in table.names if n not in claimed and {"u", "ctrl"} & {*_words(n)[:1], *_words(n)[-1:]}]
+    plain = [n for n in table.names if n not in claimed and {"u", "ctrl"} & {*words_of(n)[:1], *words_of(n)[-1:]}]
     if "command" not in found and plain:
         found["command"] = [name for name in plain if not _has_parts(name, table.names)]
     return {kind: _plainest(names) for kind, names in found.items()}
@@ -383,19 +347,19 @@ def _has_parts(name: str, names: Sequence[str]) -> bool:
 
 def _plainest(names: list[str]) -> list[str]:
     """Of several sets of columns the plain one: `q`, not `q_filt`."""
-    plain = [name for name in names if not _SHADES & set(_words(name))]
+    plain = [name for name in names if not _SHADES & set(words_of(name))]
     return plain or names
 
 
 _SHADES = {"filt", "filtered", "raw", "smooth", "smoothed", "est", "estimated", "ext", "external", "residual"}
 
 
-def _of_joints(
+def of_joints(
     table: Table, columns: list[str], model: RobotModel, joints: Sequence[str] | None, kind: str
 ) -> tuple[tuple[str, ...], Any, bool]:
     """Joints of a kind's columns in the model's order, what the task says of them, and whether names decided it."""
     wanted = list(joints or model.joint_names)
-    by_name = {joint: c for joint in wanted for c in columns if _holds(c, joint, model.joint_names)}
+    by_name = {joint: c for joint in wanted for c in columns if holds(c, joint, model.joint_names)}
     if by_name and (joints is None or len(by_name) == len(wanted)):
         names = tuple(joint for joint in model.joint_names if joint in by_name)
         if len(names) < len(columns) and joints is None:
@@ -446,7 +410,7 @@ def _of_driven(
     wanted = [one.joint for one in driven] or list(joints)
     for called in ({joint: (joint,) for joint in joints}, {one.joint: one.drives for one in driven}):
         every = [name for names in called.values() for name in names]
-        own = {joint: [c for c in columns if any(_holds(c, n, every) for n in called[joint])] for joint in called}
+        own = {joint: [c for c in columns if any(holds(c, n, every) for n in called[joint])] for joint in called}
         twice = next((own[joint] for joint in wanted if len(own.get(joint, ())) > 1), None)
         if twice:
             raise InputError(
@@ -463,7 +427,7 @@ def _of_driven(
     inside = sorted(columns, key=_number) if alike else columns
     names = {joint: {joint}.union(*(one.drives for one in driven if one.joint == joint)) for joint in joints}
     every = [name for each in names.values() for name in each]
-    held = [{joint for joint in joints if any(_holds(c, name, every) for name in names[joint])} for c in inside]
+    held = [{joint for joint in joints if any(holds(c, name, every) for name in names[joint])} for c in inside]
     if count != len(of) or (not whole and any(own - {joint} for joint, own in zip(of, held, strict=True))):
         few = f", of which {', '.join(wanted)} ha{'s' if len(wanted) == 1 else 've'} a drive" if driven else ""
         raise InputError(
@@ -488,7 +452,7 @@ def _one_set(columns: Sequence[str]) -> bool:
 def _refuse_misplaced(table: Table, columns: Sequence[str], joints: Sequence[str], model: RobotModel) -> None:
     """Refuse an order of --joints that contradicts the columns that hold a joint's name."""
     for column, joint in zip(columns, joints, strict=True):
-        own = next((name for name in model.joint_names if _holds(column, name, model.joint_names)), joint)
+        own = next((name for name in model.joint_names if holds(column, name, model.joint_names)), joint)
         if own != joint:
             raise InputError(
                 f"{table.file}: --joints names {joint} where the columns have '{column}'; their order is"
@@ -496,7 +460,7 @@ def _refuse_misplaced(table: Table, columns: Sequence[str], joints: Sequence[str
             )
 
 
-def _holds(column: str, joint: str, names: Sequence[str]) -> bool:
+def holds(column: str, joint: str, names: Sequence[str]) -> bool:
     """Whether a column's name holds a joint's, and no longer joint name that contains it."""
     own = re.search(rf"(?<![A-Za-z0-9]){re.escape(joint)}(?![A-Za-z0-9])", column)
     longer = [n for n in names if n != joint and joint in n and n in column]
@@ -567,7 +531,7 @@ def _commands(
     rate: float | None,
 ) -> Commands:
     clock = _time(table) if rate is None else None
-    kinds = _kinds(table, clock)
+    kinds = column_kinds(table, clock)
     unknown = next((name for name in stated if name not in table.names), None)
     if unknown is not None:
         raise InputError(f"{table.file}: no column '{unknown}'; its columns are {', '.join(table.names[:12])}")
@@ -586,10 +550,10 @@ def _commands(
             time = _increasing(table, clock, len(command), "commands")
         return Commands(time, command, tuple(found))
     time, _ = _stamps(table, clock, rate, len(command), {})
-    joints, source, _ = _of_joints(table, kinds["position"], model, None, "position")
+    joints, source, _ = of_joints(table, kinds["position"], model, None, "position")
     states = {"position": _matrix(table, source, joints, "position")}
     if "velocity" in kinds:
-        names, source, _ = _of_joints(table, kinds["velocity"], model, list(joints), "velocity")
+        names, source, _ = of_joints(table, kinds["velocity"], model, list(joints), "velocity")
         if names == joints:
             states["velocity"] = _matrix(table, source, joints, "velocity")
     for kind, values in states.items():
@@ -609,12 +573,14 @@ def _command_columns(
     for kind in wanted:
         found = kinds.get(kind, [])
         if kind == "command" and "torque" in wanted:
-            found = [name for name in found if not (_WORDS["position"] | _WORDS["velocity"]) & set(_words(name))]
+            found = [name for name in found if not (_WORDS["position"] | _WORDS["velocity"]) & set(words_of(name))]
         if found:
             return found
     plain = [name for name in table.names if re.fullmatch(r"(u|ctrl)([._\[]*\d+\]?)?", name)]
     claimed = {name for each in kinds.values() for name in each} | {clock}
-    return plain or [name for name in table.names if name not in claimed and _holds_any(name, names)]
+    return plain or [
+        name for name in table.names if name not in claimed and any(holds(name, one, names) for one in names)
+    ]
 
 
 def _of_drives(
@@ -622,7 +588,7 @@ def _of_drives(
 ) -> Float[np.ndarray, "samples drives"]:
     """The commands in the drives' order, by the names of drives or joints, else as they stand or are numbered."""
     for names in (drives, of):
-        by_name = {name: [c for c in columns if _holds(c, name, names)] for name in names}
+        by_name = {name: [c for c in columns if holds(c, name, names)] for name in names}
         twice = next((each for each in by_name.values() if len(each) > 1), None)
         if twice is not None and all(by_name.values()):
             raise InputError(

@@ -12,7 +12,7 @@ from ..rigid.model import RobotModel, prismatic
 from .draft_columns import Columns
 from .likeness import rigid_torque, sampled
 
-__all__ = ["baseline_said", "clock_said", "locked_said", "task_text", "unit_said"]
+__all__ = ["baseline_said", "clock_said", "locked_said", "place_said", "task_text", "unit_said"]
 
 
 def clock_said(reads: Sequence[Columns]) -> Iterator[str]:
@@ -103,7 +103,7 @@ def task_text(
     """The task, whose paths are relative where a file lies in the `folder` of the task or below it."""
     from ..formats.export import dump_yaml
 
-    robot_keys: dict[str, Any] = {"model": _place(model, folder)}
+    robot_keys: dict[str, Any] = {"model": place_said(model, folder)}
     if tuple(robot.joint_names) != tuple(whole.joint_names):
         robot_keys["joints"] = list(robot.joint_names)
     data = [_entry(read, unit, label, signs is not None, folder) for read, label in zip(reads, labels, strict=True)]
@@ -136,7 +136,7 @@ def task_text(
     return "\n".join(part.rstrip("\n") for part in parts) + "\n"
 
 
-def _place(file: Path, folder: Path | None) -> str:
+def place_said(file: Path, folder: Path | None) -> str:
     """A file as the task names it: from the task's folder where it lies in it, so that both can move; else in full."""
     whole = file.resolve()
     inside = folder is not None and whole.is_relative_to(folder.resolve())
@@ -145,7 +145,7 @@ def _place(file: Path, folder: Path | None) -> str:
 
 def _entry(read: Columns, unit: str, label: str | None, converted: bool, folder: Path | None) -> dict[str, Any]:
     entry = {key: value for key, value in read.entry.items() if key != "units"}
-    entry["file"] = _place(Path(entry["file"]), folder)
+    entry["file"] = place_said(Path(entry["file"]), folder)
     units = dict(read.entry.get("units", {}))
     if unit != "rad":
         units["position"] = unit
