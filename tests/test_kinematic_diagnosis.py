@@ -216,6 +216,22 @@ def test_random_play_of_a_joint_is_unknown_with_a_word_on_where(folder: Path):
     )
 
 
+def test_readings_that_were_rounded_are_no_joints_that_vary(folder: Path):
+    """A controller shows its own pose beside joints rounded to a thousandth of a degree: nothing is wrong with it."""
+    rng = np.random.default_rng(0)
+    (folder / "rounded.urdf").write_text(poses.urdf())
+    q = np.radians(np.round(np.degrees(poses.postures(rng, 25)), 3))
+    shown = poses.tool_poses(
+        folder / "rounded.urdf", q, poses.truth(rng), lambda k: np.radians(rng.uniform(-5e-4, 5e-4, 6))
+    )
+    seen = np.array([pose.homogeneous for pose in shown])
+    seen[:, :3, 3] = np.round(seen[:, :3, 3], 6)
+    recording = postures_of(q=q, pose=seen, base_frame="base", tool_frame="tool0")
+    forbid = [name for name in CATALOGUE if name not in ("joint_offset", "link_geometry", "joint_compliance")]
+    found = diagnose_poses(load_urdf(folder / "rounded.urdf"), [recording], forbid)
+    assert (found.verdict, found.causes) == ("nothing", ()), found.calibration.notes
+
+
 def test_a_posture_too_far_off_for_the_play_of_a_joint_is_an_outlier(folder: Path):
     """The play of a joint drawn now, and a posture drawn now that is moved by ten times what it does."""
     seed = int(np.random.SeedSequence().generate_state(1)[0])

@@ -28,7 +28,7 @@ from .calibration import Run
 from .candidates import GEOMETRY, moved_rows, moves, twist_rows
 from .kinematic_evidence import Evidence, weigh
 from .kinematic_scores import Scores, Tested, row_noise, score_blocks, score_jitter
-from .outliers import playing_joints, still_outliers
+from .outliers import playing_joints, still_outliers, variance_along
 
 if TYPE_CHECKING:
     from ..formats.config import Task
@@ -86,7 +86,7 @@ def diagnose_poses(
         own = _geometry(run, calibration, alpha, tolerance)
         p_rest = run.p_value((run.fit[1], run.fit[2]), run.choice.level, run.named)
         effects = [c for c in calibration.causes if c.name.effect not in (*GEOMETRY, "outlier")]
-        play = _play(run, alpha)
+        play = _play(run, alpha, tolerance[0])
         aside: list[tuple[Cause, str]] = []
         if play.found:  # a law that leaves its own joint erring at random is not the right one
             why = "its joint varies between postures beside it"
@@ -353,8 +353,11 @@ class _Play(NamedTuple):
     note: str
 
 
-def _play(run: Run, alpha: float) -> _Play:
-    """Errors at random from posture to posture as if a joint moved."""
+def _play(run: Run, alpha: float, tolerance: float) -> _Play:
+    """Errors at random from posture to posture as if a joint moved, by more than the rounding of good readings.
+
+    `tolerance`: rad (or m), how well a good joint is zeroed.
+    """
     final, linear, posterior, _ = run.fit
     joints = [(c.at[0], k) for k, c in enumerate(final.columns) if c.effect == "joint_offset"]
     free = levels.free_at(run.choice.level, linear.prior)
@@ -367,6 +370,10 @@ def _play(run: Run, alpha: float) -> _Play:
     base = [first + k for k, (name, _) in enumerate(final.own) if name.split()[0] == "base_frame"]
     level = posterior.noise[linear.channel]  # a posture that varies much counts in full
     which = playing_joints(linear, level, run.used, ways, linear.jacobian[:, base])
+    scale = np.asarray(final.problem.scale)[[k for _, k in joints]]
+    sizes = [scale[k] ** 2 * variance_along(linear, posterior, run.used, ways[:, k]) for k in which or [worst]]
+    if np.sqrt(max(sizes)) < thresholds.LEAST_PLAY * tolerance:
+        return _Play(False, (), run.aside, "")
     outliers = still_outliers(linear, posterior, run.used, ways[:, which[0] if which else worst], run.aside)
     names = [joints[k][0] for k in which]
     one = f"{', '.join(names[:-1])} or {names[-1]}" if len(names) > 1 else "".join(names)

@@ -16,7 +16,7 @@ from ..estimation import marginal
 from ..estimation.marginal import Linear, Posterior
 from . import thresholds
 
-__all__ = ["find_outliers", "playing_joints", "still_outliers"]
+__all__ = ["find_outliers", "playing_joints", "still_outliers", "variance_along"]
 
 Array = np.ndarray
 _STEPS = np.concatenate([[0.0], 10.0 ** np.arange(-1.5, 2.51, 0.25)])  # standard deviations that are tried
@@ -74,13 +74,9 @@ def still_outliers(
     """
     whitened = way / posterior.noise[linear.channel]
     residual = (linear.residual + linear.jacobian @ (posterior.unknowns - linear.at)) / posterior.noise[linear.channel]
-    inside = np.flatnonzero(used & (linear.posture >= 0))
-    postures = linear.posture[inside]
-    square, along = np.bincount(postures, whitened[inside] ** 2), np.bincount(postures, (whitened * residual)[inside])
-    weight = np.where(square > 0.0, square, 0.0)  # a posture counts as far as it shows the joint
-    variance = max(float(np.sum(along**2 - square) / max(np.sum(weight**2), 1e-300)), 0.0)
+    variance = variance_along(linear, posterior, used, way)
     sizes, counts = {}, {}
-    for k in (*np.unique(postures).tolist(), *suspects):
+    for k in (*np.unique(linear.posture[used & (linear.posture >= 0)]).tolist(), *suspects):
         rows = np.flatnonzero(linear.posture == k)
         rows = rows[used[rows]] if k not in suspects else rows[linear.residual[rows] != 0.0]  # 0: not measured
         G = linear.jacobian[rows] / posterior.noise[linear.channel[rows], None]
@@ -95,6 +91,18 @@ def still_outliers(
         counts[k] = len(rows)
     others = np.log([max(size, 1e-12) for k, size in sizes.items() if k not in suspects])
     return [k for k in suspects if sizes[k] >= _limit(others, counts[k])]
+
+
+def variance_along(
+    linear: Linear, posterior: Posterior, used: Bool[Array, " rows"], way: Float[Array, " rows"]
+) -> float:
+    """Variance over the postures `used` of a motion along `way`, in the square of its unit."""
+    noise = posterior.noise[linear.channel]
+    inside = np.flatnonzero(used & (linear.posture >= 0))
+    residual = (linear.residual + linear.jacobian @ (posterior.unknowns - linear.at))[inside] / noise[inside]
+    postures, shown = linear.posture[inside], way[inside] / noise[inside]
+    square, along = np.bincount(postures, shown**2), np.bincount(postures, shown * residual)
+    return max(float(np.sum(along**2 - square) / max(np.sum(square**2), 1e-300)), 0.0)
 
 
 def playing_joints(

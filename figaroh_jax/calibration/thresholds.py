@@ -35,5 +35,6 @@ LOSS_SIGMAS = 1.0  # standard errors by which left-out postures must be worse wi
 TOLD = 3.0  # logarithm of the odds (20 to 1) by which a correction of the geometry is told from another, or from none
 FAR_OFF = 2.5  # tolerances by which all links are off where a name must be the best of all that there are
 SIZE_SIGMAS = 3.0  # standard deviations from zero of some amplitude of a named effect, which is one of hundreds
+LEAST_PLAY = 0.1  # of an offset's tolerance, by which a joint that plays at random must vary for it to be told
 NOISY = 1.5  # times the device's stated accuracy: the rest is no noise
 WAVE = 1e-2  # chance that noise alone gives the largest wave of any joint, for it to be looked at
