@@ -289,6 +289,23 @@ def test_no_error_is_said_to_fall_that_does_not(tmp_path: Path, capsys: Any):
         assert ("falls from" in said[level]) == (falls and level != "frames"), (said[level], told)
 
 
+def test_a_level_whose_effects_go_again_gives_way_to_the_frames(tmp_path: Path):
+    """Joints swept one by one, two of which play: links predict better beside effects that no fold finds again."""
+    rng = np.random.default_rng(66)
+    (tmp_path / "robot.urdf").write_text(poses.urdf())
+    home, sweep = np.array([0.2, -0.5, 0.4, 0.3, 0.8, -0.3]), np.linspace(-0.8, 0.8, 6)
+    q = np.array([home + np.eye(6)[j] * x * (0.5 if j < 3 else 1.5) for j in range(6) for x in sweep])
+    real = poses.truth(rng)
+    play = rng.normal(size=q.shape) * 3e-4 * np.array([1, 1, 0, 0, 0, 0])
+    points = poses.points(poses.tool_poses(tmp_path / "robot.urdf", q, real, lambda k: play[k]), real, rng, 5e-5)
+    recording = fj.postures(q=q, position=points, base_frame="base", tool_frame="tool0")
+    forbid = ("gear_transmission_error", "joint_compliance", "link_compliance", "thermal_growth", "settling")
+    forbid = (*forbid, "encoder_eccentricity", "encoder_scale", "backlash")
+    found = fj.calibrate(fj.load_urdf(tmp_path / "robot.urdf"), [recording], forbid=forbid)
+    assert found.level == "frames" and found.causes == () and found.position is not None
+    assert found.position.validated_after == found.position.validated_before
+
+
 def placed(folder: Path, unknown: list[str], base: pin.SE3, markers: int = 1) -> Path:
     """A task of postures of the robot as its URDF is, measured by a device at `base`, with `unknown` as stated."""
     rng = np.random.default_rng(3)

@@ -185,14 +185,23 @@ class Run:
                 self._or_frames_alone()
             else:
                 self.notes.append(f"the requested level {self.level} predicts no better than the frames alone")
+        self._name()
+        alone = self.level is None and self.choice.level != "frames" and not self.named
+        if alone and not _better(self.folds, "plain", self.folds, "frames"):  # what it predicted by has no name
+            self.choice, self.folds = self._frames_alone()
+            self.__dict__.pop("p_effects", None)
+            self._name()
+        if self.history:
+            self.notes.append("the error of a posture depends on the one before it in a way that no effect explains")
+        return self._result()
+
+    def _name(self) -> None:
+        """The effects that the folds find again and that are sure, fitted beside the level."""
         recurring = _recurring(self.choice, self.folds, self.blocks)
         self.named = [k for k in recurring if self.blocks[k].effect is not HISTORY]
         self.history = len(self.named) < len(recurring)
-        if self.history:
-            self.notes.append("the error of a posture depends on the one before it in a way that no effect explains")
         self.progress("fitting", 0.85)
         self._name_the_sure()
-        return self._result()
 
     def _name_the_sure(self) -> None:
         """Leave out effects whose gain noise alone may bring, or whose size may be zero, and fit the others."""
@@ -252,9 +261,12 @@ class Run:
 
     def _or_frames_alone(self) -> None:
         """Frames and their own effects, but for effects that predict better beside the level that was chosen."""
-        alone = levels.choose(self.measured, self.used, self.effects, "frames"), self._validated("frames")
+        alone = self._frames_alone()
         if not (self.choice.effects and _better(self.folds, "chosen", alone[1], "chosen")):
             self.choice, self.folds = alone
+
+    def _frames_alone(self) -> tuple[levels.Choice, list[levels.Fold]]:
+        return levels.choose(self.measured, self.used, self.effects, "frames"), self._validated("frames")
 
     def _validated(self, level: str | None) -> list[levels.Fold]:
         """The outer folds, each with its own choice, or of its own effects beside the given level."""
