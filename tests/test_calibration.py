@@ -18,8 +18,10 @@ import figaroh_jax as fj
 from figaroh_jax import cli
 from figaroh_jax.calibration.calibrated import Calibration
 from figaroh_jax.calibration.calibration import calibrate_task
+from figaroh_jax.calibration.kinematic_diagnosis import diagnose_poses
+from figaroh_jax.effects.kinematic import CATALOGUE
 from figaroh_jax.formats.config import load_task
-from figaroh_jax.recordings.posture_checks import OFF
+from figaroh_jax.recordings.posture_checks import OFF, check_pose_recording
 from figaroh_jax.reporting.calibration_report import nominal_of
 from figaroh_jax.reporting.picture import segments
 from figaroh_jax.reporting.verification import DEFAULT_LIMITS
@@ -289,21 +291,36 @@ def test_no_error_is_said_to_fall_that_does_not(tmp_path: Path, capsys: Any):
         assert ("falls from" in said[level]) == (falls and level != "frames"), (said[level], told)
 
 
-def test_a_level_whose_effects_go_again_gives_way_to_the_frames(tmp_path: Path):
-    """Joints swept one by one, two of which play: links predict better beside effects that no fold finds again."""
-    rng = np.random.default_rng(66)
+def test_a_level_whose_effects_go_again_gives_way_to_the_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Beside its effects it predicts better than the frames, by itself it does not, and no fold finds them again."""
+    rng = np.random.default_rng(3)
     (tmp_path / "robot.urdf").write_text(poses.urdf())
-    home, sweep = np.array([0.2, -0.5, 0.4, 0.3, 0.8, -0.3]), np.linspace(-0.8, 0.8, 6)
-    q = np.array([home + np.eye(6)[j] * x * (0.5 if j < 3 else 1.5) for j in range(6) for x in sweep])
-    real = poses.truth(rng)
-    play = rng.normal(size=q.shape) * 3e-4 * np.array([1, 1, 0, 0, 0, 0])
-    points = poses.points(poses.tool_poses(tmp_path / "robot.urdf", q, real, lambda k: play[k]), real, rng, 5e-5)
+    q, real = poses.postures(rng, 15), poses.truth(rng, offset=OFFSET, compliance=np.array([0.0, 2e-3, 0, 0, 0, 0]))
+    points = poses.points(poses.tool_poses(tmp_path / "robot.urdf", q, real), real, rng)
     recording = fj.postures(q=q, position=points, base_frame="base", tool_frame="tool0")
-    forbid = ("gear_transmission_error", "joint_compliance", "link_compliance", "thermal_growth", "settling")
-    forbid = (*forbid, "encoder_eccentricity", "encoder_scale", "backlash")
+    kept = ("joint_offset", "link_geometry", "joint_compliance")
+    for name, answer in (("_better", lambda folds, one, others, other: one == "chosen"), ("_recurring", lambda *_: [])):
+        monkeypatch.setattr(f"figaroh_jax.calibration.calibration.{name}", answer)
+    forbid = [name for name in CATALOGUE if name not in kept]
     found = fj.calibrate(fj.load_urdf(tmp_path / "robot.urdf"), [recording], forbid=forbid)
-    assert found.level == "frames" and found.causes == () and found.position is not None
+    assert found.level == "frames" and found.position is not None
     assert found.position.validated_after == found.position.validated_before
+
+
+def test_a_joint_that_is_counted_with_the_one_before_it_is_told_and_nothing_else_named(tmp_path: Path):
+    """The forearm's angle against the upper arm's, as of a Fanuc: the check says what to write, and that is right."""
+    rng = np.random.default_rng(6)
+    (tmp_path / "robot.urdf").write_text(poses.urdf())
+    q, real = poses.postures(rng, 25), poses.truth(rng)
+    points = poses.points(poses.tool_poses(tmp_path / "robot.urdf", q, real), real, rng)
+    rows = np.eye(6)
+    rows[2, 1] = -1.0
+    model = fj.load_urdf(tmp_path / "robot.urdf")
+    seen = fj.postures(q=q @ rows.T, position=points, base_frame="base", tool_frame="tool0")
+    (told,) = check_pose_recording(seen, model)
+    assert "with j3 + j2 as the angle of j3" in told.text and "position is [0, -1, 1, 0, 0, 0]" in told.text
+    found = diagnose_poses(model, [seen], forbid=[name for name in CATALOGUE if name != "joint_offset"])
+    assert found.calibration.contradicted and (found.verdict, found.causes) == ("unknown", ())
 
 
 def placed(folder: Path, unknown: list[str], base: pin.SE3, markers: int = 1) -> Path:

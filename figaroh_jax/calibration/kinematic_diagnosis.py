@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PoseDiagnosis", "diagnose_pose_task", "diagnose_poses"]
 
+_CONTRADICTED = "the measured points do not follow the model's postures"
 _WIDE, _HELD = 100.0, 1e-6  # of a block that was named: free; of one that is taken away
 
 
@@ -107,10 +108,14 @@ def diagnose_poses(
             within = [c for c, s in zip(outliers, still, strict=True) if not s]
             notes += [f"{c.note}, no farther than a joint that varies so may move it" for c in within]
             outliers = [c for c, s in zip(outliers, still, strict=True) if s]
+        if calibration.contradicted:
+            aside += [(c, _CONTRADICTED) for c in effects]
+            own = own._replace(nearest=[*own.nearest, *(Nearest(c.name, 0.0, _CONTRADICTED) for c in geometry)])
+            outliers, geometry, effects = [], [], []
         causes = tuple([*outliers, *geometry, *effects])
         p_value = min(1.0, 2.0 * min(own.p_value, run.p_effects))
         rest = own.rest or run.history or play.found or p_rest < thresholds.OF_ALPHA * alpha
-        rest = rest or _beyond_accuracy(recordings, calibration)
+        rest = rest or calibration.contradicted or _beyond_accuracy(recordings, calibration)
         rest = rest or (found and not (geometry or effects)) or len(own.causes) > len(geometry)
         nearest = [*own.nearest, *(Nearest(c.name, _share(c.gain), why) for c, why in aside)]
         nearest += run.unsure

@@ -187,7 +187,7 @@ def _overlaid(points: np.ndarray, turned: np.ndarray, origin: np.ndarray, *, fix
 
 
 def _readings(q: np.ndarray, model: RobotModel, unit: str) -> Iterator[tuple[str, np.ndarray]]:
-    """The same columns in another unit, a pair swapped, a sign turned."""
+    """The same columns in another unit, a pair swapped, a sign turned, a joint that counts the one before it."""
     turns, names = ~np.array(prismatic(model)), model.dof_names
     if unit == "rad":
         yield "they would in degrees: add units: {position: deg}", q * np.where(turns, DEGREE, 1e-3)
@@ -201,6 +201,17 @@ def _readings(q: np.ndarray, model: RobotModel, unit: str) -> Iterator[tuple[str
             order = list(range(len(names)))
             order[i], order[j] = j, i
             yield f"they would with the columns of {names[i]} and {names[j]} swapped", q[:, order]
+    for i in np.flatnonzero(turns[1:] & turns[:-1]):  # an arm whose forearm keeps its slope where the upper arm moves
+        for sign in (1.0, -1.0):
+            row = np.eye(len(names), dtype=int)[i + 1] - int(sign) * np.eye(len(names), dtype=int)[i]
+            other = q.copy()
+            other[:, i + 1] += sign * q[:, i]
+            yield (
+                f"they would with {names[i + 1]} {'+' if sign > 0 else '-'} {names[i]} as the angle of {names[i + 1]}:"
+                f" the columns are no joint angles, as those of a Fanuc; the row of {names[i + 1]} in"
+                f" transmission.position is {row.tolist()}",
+                other,
+            )
 
 
 def _orientations(recording: PoseRecording, model: RobotModel, seen: np.ndarray) -> Iterator[Finding]:
