@@ -22,6 +22,7 @@ from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.recordings.checks import check_recordings
 from figaroh_jax.recordings.dataset import read_recordings
 from figaroh_jax.recordings.likeness import Sampled, frame_poses, rigid_torque, stretch_of_time
+from figaroh_jax.recordings.posture_checks import check_pose_recording
 
 # its slide takes mm
 NOT_HERE = {"mm on a revolute arm"}
@@ -213,6 +214,21 @@ def test_poses_in_another_convention_are_told(spoil: Any, words: str, tmp_path: 
     robot = {"model": str(tmp_path / "robot.urdf"), "joints": list(poses.JOINTS)}
     what, text = said(Base("run", robot, arrays, entry), None, tmp_path)
     assert (what == "silent") if not words else re.search(words, f"{what}: {text}"), (what, text)
+
+
+@pytest.mark.parametrize("form", ["xyzw", "wxyz"])
+def test_quaternions_in_another_order_are_told_where_the_robot_turns_little(form: str, tmp_path: Path):
+    """Postures of a camera before one target, 0.1 rad apart: the wrong order is off by less than a wrong robot may."""
+    rng = np.random.default_rng(12)
+    (tmp_path / "robot.urdf").write_text(poses.urdf())
+    q = np.array([0.2, -0.5, 0.4, 0.3, 0.8, -0.3]) + rng.uniform(-0.06, 0.06, (40, 6))
+    real = poses.truth(rng, offset=np.array([0.0, 0.002, -0.001, 0.002, 0.001, 0.0]))
+    seen = quaternions(np.array([pose.homogeneous for pose in poses.tool_poses(tmp_path / "robot.urdf", q, real)]))
+    seen = seen if form == "xyzw" else seen[:, [0, 1, 2, 6, 3, 4, 5]]
+    recording = fj.postures(q=q, pose=seen, base_frame="base", tool_frame="tool0")
+    found = check_pose_recording(recording, load_urdf(tmp_path / "robot.urdf"))
+    assert [finding.wrong for finding in found] == ([] if form == "xyzw" else [True])
+    assert form == "xyzw" or "or add `orientation: wxyz`" in found[0].text
 
 
 @pytest.mark.parametrize("factor", [1 / 7, 1000.0])

@@ -29,6 +29,8 @@ __all__ = ["OFF", "check_pose_recording", "check_pose_recordings", "spread_of"]
 OFF = 0.12  # share of the points' spread that no calibration leaves
 FEWEST = 8
 TURNED = 0.15  # rad between orientations that no calibration leaves
+CLEARLY = 0.2  # of what is left as written that may be left the other way round, for it to be the right one
+FAIR = 5e-3  # rad between orientations, that are right as they are
 
 
 def check_pose_recordings(task: Task | None, model: RobotModel, recordings: Sequence[PoseRecording]) -> tuple[str, ...]:
@@ -223,14 +225,16 @@ def _orientations(recording: PoseRecording, model: RobotModel, seen: np.ndarray)
     turned, _ = frame_poses(model, recording.position[seen][whole], recording.tool_frame)
     base, _ = frame_poses(model, recording.position[seen][whole], recording.base_frame)
     own = _turns(base.swapaxes(1, 2) @ turned)
-    if _unlike(own, _turns(measured[whole])) < TURNED:
-        return
+    off = _unlike(own, _turns(measured[whole]))
     # w x y z read as x y z w is the inverse orientation between two other frames: a roll and a conjugation of the four
     # numbers make a rotation of their space, and such a one is a product with a quaternion on each side
-    inverse = _unlike(own, _turns(measured[whole].swapaxes(1, 2))) < TURNED
+    back = _unlike(own, _turns(measured[whole].swapaxes(1, 2)))
+    if off < TURNED and (off < FAIR or back > CLEARLY * off):  # small turns are never far off, but clearly another way
+        return
+    inverse = back < TURNED
     advice = (
-        "they do as w x y z, or transposed: quaternions are x y z w (name the columns in that order), and the"
-        " orientation is that of the marker in the device's frame"
+        "they do as w x y z, or transposed: quaternions are x y z w (name the columns in that order, or add"
+        " `orientation: wxyz` to the measurement), and the orientation is that of the marker in the device's frame"
     )
     yield Finding(
         inverse,
