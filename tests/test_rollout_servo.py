@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from figaroh_jax.results import Name
+from figaroh_jax.rollouts.causes import Candidate
 from figaroh_jax.rollouts.data import Run
 from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.parameters import put
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import search
+from figaroh_jax.rollouts.search import Named, leading, search
 from figaroh_jax.rollouts.setting import setting
-from figaroh_jax.rollouts.task import simulated
+from figaroh_jax.rollouts.task import proxies, simulated
 
 LEFT_OUT = ("payload", "encoder_offset", "torque_offset", "joint_elasticity", "backlash")  # alike beside free gains
 
@@ -51,3 +53,15 @@ def test_a_drive_at_its_limit_is_found_though_the_baseline_looks_soft_and_heavy(
     begun = put(here.loop, here.known.table, found.first.theta)
     ended = put(found.structure.loop, found.structure.table, found.last.theta)
     assert error(ended) < 0.5 * error(begun)
+
+
+def test_what_comes_near_are_fits_that_did_not_diverge():
+    assert leading([float("nan"), 0.1, 0.3, float("-inf"), -0.2, 0.2]) == [2, 5, 1]
+
+
+def test_a_proxy_is_told_with_what_does_as_well():
+    """A load and a drive's gain look alike to the joint that carries the load."""
+    load = Candidate("payload", ("arm",), (7,), ((0.1,),), ("mass",))
+    assert proxies([Named(load, 5.0, 0.8, (Name("actuator_gain", ("servo",)),))]) == (
+        "payload (arm) or actuator_gain (servo)"
+    )

@@ -63,6 +63,7 @@ __all__ = [
     "Tried",
     "all_but",
     "judged_by_colour",
+    "leading",
     "scored",
     "search",
     "settled",
@@ -531,7 +532,7 @@ def _best(
         for g, w, t, n, one in zip(gains, worth, ts, needs, tried, strict=True)
     ]
     passing = [k for k in range(len(tried)) if enough[k] and sized(here, tried[k])]
-    for k in np.argsort(gains)[::-1][:3]:
+    for k in leading(gains):
         why = TOO_LITTLE if not enough[k] else why_not_sized(here, tried[k]) or "no better than another"
         nearest.append((Name(tried[k].candidate.effect, tried[k].candidate.at), float(max(gains[k], 0.0)), why))
     if not passing:
@@ -560,6 +561,11 @@ def _best(
             alike.append(Name(tried[other].candidate.effect, tried[other].candidate.at))
     named = Named(best.candidate, ts[k], float(gains[k]), tuple(alike), _rms(here, before), _rms(here, best.sse))
     return (named, best.state), p
+
+
+def leading(gains: Sequence[float]) -> list[int]:
+    """The three that gain most; a loop that diverges tells nothing."""
+    return [int(k) for k in np.argsort(gains)[::-1] if np.isfinite(gains[k])][:3]
 
 
 def _held_out(here: Setting, now: Model, tried: Sequence[Tried]) -> tuple[list[Tried], np.ndarray]:

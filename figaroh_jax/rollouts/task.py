@@ -55,6 +55,7 @@ __all__ = [
     "judged_note",
     "judged_rows",
     "one_number_notes",
+    "proxies",
     "read_rollouts",
     "simulated",
 ]
@@ -540,13 +541,18 @@ def _experiment(found: Search) -> Experiment | None:
     return None
 
 
+def proxies(found: Sequence[Named]) -> str:
+    """Each of the best proxies, with what does as well in its place."""
+    return ", ".join(" or ".join(map(str, (Name(n.candidate.effect, n.candidate.at), *n.alike))) for n in found)
+
+
 def _rest(found: Search, left: np.ndarray, noise: np.ndarray, loop: Loop, traces: Sequence[Trace]) -> Rest:
     if found.verdict in ("nothing", "named"):
         return Rest(np.zeros(0))
     names = tuple(loop.robot.dof_names[k] for k in loop.measured)
     k = int((left / noise).argmax())
     text = f"{1e3 * left[k]:.3g} mrad at {names[k]} against {1e3 * noise[k]:.3g} of noise"
-    proxy = ", ".join(str(Name(n.candidate.effect, n.candidate.at)) for n in found.proxy)
+    proxy = proxies(found.proxy)
     text = f"{text}; best proxy, not a cause: {proxy}" if proxy else text
     size = relative_rest(left, noise, traces)
     return Rest(size, parts_of(traces, names, noise, size), nearest_of(found), text)
