@@ -288,6 +288,34 @@ def test_the_task_of_poses_with_quaternions_names_every_column(made, tmp_path: P
     np.testing.assert_allclose(recording.values[:, :3, 3], pose[:, :3], rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("numbered", [True, False])
+def test_the_task_of_poses_with_angles_names_every_column_and_unit(numbered: bool, made, tmp_path: Path):
+    """A table of a robot's display: mm and degrees in the names, joints by number or by name, a column of words."""
+    from scipy.spatial.transform import Rotation
+
+    urdf, joints, (run, *_) = made
+    point, turned = np.random.default_rng(0).normal(size=(2, 30, 3))
+    columns: dict[str, Any] = {"image": [f"images/{k}.png" for k in range(30)]}
+    columns |= {f"{axis}_mm": 1e3 * point[:, k] for k, axis in enumerate("xyz")}
+    columns |= {f"r{axis}_deg": np.rad2deg(turned[:, k]) for k, axis in enumerate("xyz")}
+    slides = [joint.kind == "prismatic" for joint in fj.load_urdf(urdf).joints]
+    degrees = np.where(slides, run["position"][:30], np.rad2deg(run["position"][:30]))
+    columns |= {f"A{j + 1}_deg" if numbered else f"{joint}_deg": degrees[:, j] for j, joint in enumerate(joints)}
+    rows = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
+    (tmp_path / "poses.csv").write_text("\n".join(rows))
+    with pytest.raises(InputError, match="a task for `calibrate`") as caught:
+        draft_task(urdf, [tmp_path / "poses.csv"])
+    shown = " ".join(str(caught.value).split()).partition("The task is ")[2].partition(" where MODEL")[0]
+    shown = shown.replace("MODEL", str(urdf)).replace("BASE", joints[0]).replace("TOOL", joints[-1])
+    (tmp_path / "task.yaml").write_text(shown)
+    task = load_task(tmp_path / "task.yaml")
+    (recording,) = read_pose_recordings(task, load_robot(task))
+    np.testing.assert_allclose(recording.position, run["position"][:30], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(recording.values[:, :3, 3], point, rtol=0, atol=1e-9)
+    expected = Rotation.from_euler("xyz", turned).as_matrix()
+    np.testing.assert_allclose(recording.values[:, :3, :3], expected, rtol=0, atol=1e-9)
+
+
 def test_fewer_columns_than_joints_are_told_how_to_name_theirs(made, tmp_path: Path):
     urdf, _, (run, *_) = made
     np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"][:, :2], tau=run["torque"][:, :2])

@@ -187,8 +187,10 @@ def _positions(
     named = [n for n in named if n in kinds.get("position", ())] or named
     rest = [n for n in table.names if n not in measured]
     found = [n for n in kinds.get("position", ()) if n not in measured and n not in _turned(table.names)[0]]
-    if not found and len(rest) == len(joints or model.joint_names) > 1:
-        found = rest
+    if not found:
+        rest = [n for n in rest if n not in _turned(table.names)[0]]
+        count = len(joints or model.joint_names)
+        found = rest if len(rest) == count > 1 else _numbered(rest, count)
     found = named or found
     if not found:
         raise _unclear(table, model, "JOINTS", "no column looks like a position of a joint")
@@ -205,6 +207,16 @@ def _positions(
     return sets
 
 
+def _numbered(names: Sequence[str], count: int) -> list[str]:
+    """The columns that differ in a number alone and are as many as there are joints."""
+    sets: dict[str, list[str]] = {}
+    for name in names:
+        if re.search(r"\d", name):
+            sets.setdefault(re.sub(r"\d+", "#", name), []).append(name)
+    found = [one for one in sets.values() if len(one) == count > 1]
+    return found[0] if len(found) == 1 else []
+
+
 def _chains(model: RobotModel, count: int) -> list[tuple[str, ...]]:
     """The chains of so many joints, each carried by the one before: an arm without its fingers."""
     above: list[list[str]] = []
@@ -217,7 +229,7 @@ def _turned(names: Sequence[str]) -> tuple[list[str], list[str]]:
     """Columns of orientations in their order, and what they may be as `measurement.orientation` says it."""
     for pattern, ways in (
         (r"(?:.*[_. ])?q?_?({})", ("xyzw", ["xyzw"])),
-        (r"(?:.*[_. ])?r_?({})(?:[ _]?[\[(]?(?:deg|rad)[\])]?)?", ("xyz", ["rpy", "rotvec"])),
+        (r"(?:.*[_. ])?(?:r|rv|rot|ori|phi)_?({})\d*(?:[ _]?[\[(]?(?:deg|rad)[\])]?)?", ("xyz", ["rpy", "rotvec"])),
         (r"(?:.*[_. ])?({})(?:[ _]?[\[(]?(?:deg|rad)[\])]?)?", ("roll pitch yaw", ["rpy"])),
         (r"(?:.*[_. ])?({})(?:[ _]?[\[(]?(?:deg|rad)[\])]?)?", ("wpr", ["rpy"])),  # Fanuc
         (r"(?:.*[_. ])?({})(?:[ _]?[\[(]?(?:deg|rad)[\])]?)?", ("cba", ["rpy"])),  # KUKA: A turns about z
@@ -397,22 +409,22 @@ def _unclear(table: Table, model: RobotModel, position: Any, why: str) -> InputE
     """The refusal of postures, with the task that a user can complete."""
     from ..formats.export import dump_yaml
 
-    measured = _measured(table, model)
-    named = [n for n in table.names if n in model.joint_names]
-    robot = {"model": "MODEL"} | ({"joints": named} if named and named != [*model.joint_names] else {})
-    turned, ways = _turned(table.names)
-    whole = np.ndim(table.read(measured[0])) > 1
-    points = [n for n in measured if n not in turned]
-    shown: Any = measured[0] if whole else [*points[:3], *turned] if turned and len(points) == 3 else points[:12]
-    posed = "pose" in measured[0].lower() or measured[0].startswith("T_") or shown == [*points[:3], *turned]
-    kind = "pose" if posed and (whole or turned) else "position"
+    measured, (turned, ways) = _measured(table, model), _turned(table.names)
     columns = [position] if isinstance(position, str) else [*position]
-    said = {word for name in (*columns, *measured) for word in words_of(name)}
-    units = {key: unit for key, unit in (("position", "deg"), ("measurement", "mm")) if unit in said}
+    named = [j for n in columns for j in model.joint_names if holds(n, j, model.joint_names)]
+    robot = {"model": "MODEL"} | ({"joints": named} if named and named != [*model.joint_names] else {})
+    whole = np.ndim(table.read(measured[0])) > 1
+    places = [n for n in measured if n not in turned]
+    turned = turned if len(places) == 3 and not whole else []
+    shown: Any = measured[0] if whole else [*places[:12], *turned]
+    posed = "pose" in measured[0].lower() or measured[0].startswith("T_") if whole else bool(turned)
+    asked = (("position", "deg", columns), ("measurement", "mm", places), ("orientation", "deg", turned))
+    units = {key: unit for key, unit, names in asked if any(unit in words_of(name) for name in names)}
     frames = {"base_frame": "BASE", "tool_frame": "TOOL", "unknown": ["base_frame", "tool_frame"]}
     entry = {"file": table.file.name, "position": position if isinstance(position, str) else columns}
     entry |= {"units": units} if units else {}
-    orientation = {"orientation": ways[0]} if kind == "pose" and not whole and ways[0] != "xyzw" else {}
+    orientation = {"orientation": ways[0]} if turned and ways[0] != "xyzw" else {}
+    kind = "pose" if posed else "position"
     task = {"robot": robot, "data": [entry | {"measurement": {kind: shown, **orientation, **frames}}]}
     return InputError(
         f"{table.file}: {', '.join(measured[:6])} look like measured poses or points, but {why}. Postures are a task"
@@ -420,4 +432,6 @@ def _unclear(table: Table, model: RobotModel, position: Any, why: str) -> InputE
         f"  {dump_yaml(task, line=True).strip()}\n"
         "where MODEL is the robot's file, and BASE and TOOL are frames of it; the measurement is a `pose`, `position`,"
         " `plane`, `socket` or `camera`."
+        + " Angles are roll, pitch, yaw about fixed x, y, z (`rpy`), or an axis times an angle (`rotvec`)."
+        * bool(orientation)
     )
