@@ -72,3 +72,14 @@ def test_degrees_taken_for_rad_are_told(tmp_path: Path):
 def test_an_orientation_of_points_is_refused(tmp_path: Path):
     with pytest.raises(fj.InputError, match="orientation belongs to the kinds pose and camera"):
         read(tmp_path, WRITTEN["rpy"], ", orientation: rpy", kind="position")
+
+
+def test_a_camera_in_the_hand_that_sees_no_orientation_is_told():
+    seen = np.full((12, 4, 4), np.nan)
+    seen[:, :3, 3] = POINTS
+    seen[:, 3] = 0.0, 0.0, 0.0, 1.0
+    with pytest.raises(fj.InputError, match="no orientation of the board was measured, which a camera"):
+        fj.postures(q=np.zeros((12, 4)), camera=seen, mount="hand", base_frame="base", tool_frame="hand")
+    seen[4, :3, :3] = np.eye(3)
+    run = fj.postures(q=np.zeros((12, 4)), camera=seen, mount="hand", base_frame="base", tool_frame="hand")
+    assert np.isfinite(run.values).all(axis=(1, 2)).tolist() == [k == 4 for k in range(12)]

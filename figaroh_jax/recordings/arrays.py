@@ -177,9 +177,7 @@ def _measurement(
         return kind, poses.points(values, table, kind) * scale
     found = poses.poses(values, table, kind)
     found[:, :3, 3] *= scale
-    if poses.carried(kind, mount):
-        found = np.linalg.inv(np.where(np.isfinite(found), found, np.nan))
-    return "pose", found
+    return "pose", poses.seen_from_board(found, table, kind) if poses.carried(kind, mount) else found
 
 
 def _matrix(x: ArrayLike, key: str, source: Memory) -> np.ndarray:

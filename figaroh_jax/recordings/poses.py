@@ -30,7 +30,7 @@ from .tables import Source, Table
 if TYPE_CHECKING:
     from ..formats.config import Load, Measurement, RecordingEntry, Task
 
-__all__ = ["PoseRecording", "points", "poses", "read_pose_recordings", "whole_numbers"]
+__all__ = ["PoseRecording", "points", "poses", "read_pose_recordings", "seen_from_board", "whole_numbers"]
 
 _LOOSE = 1e-2  # how far a rotation or a quaternion may be off by rounding
 _MOST_ANGLE = 6.5  # rad, of an orientation: a turn and a little
@@ -167,9 +167,19 @@ def _values(table: Table, entry: RecordingEntry, key: str, samples: int, scale: 
         values = _with_quaternions(values, measurement.orientation, degrees, table, where)
     found = poses(values, table, where)
     found[:, :3, 3] *= scale
-    if carried(kind, measurement.mount):  # the board stands still: the camera's pose seen from it
-        found = np.linalg.inv(np.where(np.isfinite(found), found, np.nan))
-    return "pose", found
+    return "pose", seen_from_board(found, table, where) if carried(kind, measurement.mount) else found
+
+
+def seen_from_board(
+    found: Float[np.ndarray, "postures 4 4"], table: Any, key: str
+) -> Float[np.ndarray, "postures 4 4"]:
+    """Poses of a camera seen from the board, which stands still; NaN where the board's orientation was not measured."""
+    if np.isfinite(found[:, :3, 3]).all(axis=1).any() and not np.isfinite(found).all(axis=(1, 2)).any():
+        raise InputError(
+            f"{table.file}: {key}: no orientation of the board was measured, which a camera in the hand needs; for a"
+            " point that it sees write a device of your own (examples/own_device.py)"
+        )
+    return np.linalg.inv(found)
 
 
 def _array(table: Table, source: str | tuple[str, ...], key: str) -> np.ndarray:
