@@ -316,6 +316,13 @@ def test_the_task_of_poses_with_angles_names_every_column_and_unit(numbered: boo
     np.testing.assert_allclose(recording.values[:, :3, :3], expected, rtol=0, atol=1e-9)
 
 
+def test_numbers_without_a_header_are_told_to_have_none(made, tmp_path: Path):
+    urdf, _, (run, *_) = made
+    np.savetxt(tmp_path / "run.txt", np.column_stack([run["time"], run["position"]]))
+    with pytest.raises(InputError, match="run.txt has no header line.* its columns are column_1 to column_4"):
+        draft_task(urdf, [tmp_path / "run.txt"])
+
+
 def test_fewer_columns_than_joints_are_told_how_to_name_theirs(made, tmp_path: Path):
     urdf, _, (run, *_) = made
     np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"][:, :2], tau=run["torque"][:, :2])

@@ -140,6 +140,8 @@ def _read(
     drives: Callable[[Sequence[str]], Sequence[Driven]],
 ) -> Columns:
     form = entry.get("format")
+    if form is None:
+        _refuse_numbers_alone(table)
     clock = (_LOGGED[form]["time"] if form else _time(table)) if rate is None else None
     kinds = _logged(table, _LOGGED[form]) if form else column_kinds(table, clock)
     if "position" not in kinds:
@@ -195,6 +197,15 @@ def without_sign(*torques: Float[np.ndarray, "samples joints"]) -> bool:
     """Whether no column ever changes its sign, and there are several."""
     low, high = np.min([x.min(axis=0) for x in torques], axis=0), np.max([x.max(axis=0) for x in torques], axis=0)
     return len(low) > 1 and bool(((low >= 0) | (high <= 0)).all())
+
+
+def _refuse_numbers_alone(table: Table) -> None:
+    """A text table without a header: no name says what its columns are."""
+    if all(re.fullmatch(r"column_\d+", name) for name in table.names):
+        raise InputError(
+            f"{table.file} has no header line, and `new` knows columns by their names: write one above its numbers"
+            f" (time, q1, ..., tau1, ...), or a task, in which its columns are {table.names[0]} to {table.names[-1]}"
+        )
 
 
 _LOGGED = {
