@@ -51,6 +51,9 @@ class Estimate(NamedTuple):
     std: float
     unit: str
 
+    def __str__(self) -> str:
+        return f"{self.value:.6g} {self.unit}".rstrip() + f" (σ {self.std:.2g})"
+
 
 class BoundedEstimate(Estimate):
     """An estimate of what cannot be below `least`: its interval is told as cut there."""
@@ -71,6 +74,9 @@ class Gain:
     after: float
     unit: str = "relative RMS"
 
+    def __str__(self) -> str:
+        return f"error {self.before:.3g} -> {self.after:.3g} ({self.unit})"
+
 
 @dataclass(frozen=True)
 class Cause:
@@ -87,6 +93,11 @@ class Cause:
     ambiguous_with: tuple[Name, ...] = ()
     found: int = 0  # place in the order of discovery, from 1
     note: str = ""  # e.g. what MJCF and URDF cannot express
+
+    def __str__(self) -> str:
+        sizes = ", ".join(f"{key} {value}" for key, value in self.parameters.items())
+        rivals = f"; not told from {', '.join(map(str, self.ambiguous_with))}" if self.ambiguous_with else ""
+        return f"{self.name}: {sizes}; {self.gain}{rivals}"
 
 
 @dataclass(frozen=True)
@@ -183,7 +194,7 @@ class Trace:
     counted: Bool[np.ndarray, "samples nv"] | None = None  # False: near a gap, below a gate, at rest; None: all
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Selection:
     """What a search among effects decides, the same for every job; reports and JSON files are views of it."""
 
@@ -191,8 +202,14 @@ class Selection:
     causes: tuple[Cause, ...]  # diagnoses of torque: by their gain
     solution: Any = None  # estimation.solution.Fit of the model with the causes in it, where the job has one
 
+    def __repr__(self) -> str:
+        return "\n".join([f"{type(self).__name__}: {self._headline()}", *(f"  {cause}" for cause in self.causes)])
 
-@dataclass(frozen=True)
+    def _headline(self) -> str:
+        return self.verdict
+
+
+@dataclass(frozen=True, repr=False)
 class Diagnosis(Selection):
     """Verdict, causes by their gain, and everything the report needs to show why."""
 
@@ -216,6 +233,9 @@ class Diagnosis(Selection):
     remark: str = ""  # a sentence that the headline says besides what is missing
     links: Links | None = None  # of the file, where the torque moves them further than they are believed
     refitted: tuple[str, ...] = ()  # numbers of the model file that the baseline's fit surely moved, in words
+
+    def _headline(self) -> str:
+        return f"{self.verdict}; held out: {self.holdout}"
 
     @property
     def torque_units(self) -> tuple[str, ...]:

@@ -229,4 +229,4 @@ def test_the_python_block_for_those_who_come_from_mujoco_runs(tmp_path: Path) ->
     )
     run = subprocess.run([sys.executable, "-c", before + text], capture_output=True, text=True, cwd=tmp_path)
     assert run.returncode == 0, run.stderr[-1500:]
-    assert float(re.search(r"value=([-\d.]+)", run.stdout)[1]) == pytest.approx(TRUTH["damping"], abs=0.02)  # pyright: ignore[reportOptionalSubscript]
+    assert float(re.search(r"([-\d.]+) N m s/rad", run.stdout)[1]) == pytest.approx(TRUTH["damping"], abs=0.02)  # pyright: ignore[reportOptionalSubscript]

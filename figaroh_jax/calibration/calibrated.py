@@ -64,7 +64,7 @@ class SocketDistance(NamedTuple):
     after: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Calibration(Selection):
     """The calibrated robot, what was estimated and how well it predicts; `solution.model` is that robot."""
 
@@ -87,6 +87,11 @@ class Calibration(Selection):
     correlations: tuple[tuple[str, str, float], ...] = ()  # of identified parameters, the strongest
     posture: dict[str, float] = field(default_factory=dict)  # of the joints that are locked, rad or m
     unexplained: float | None = None  # held-out error over the measured points' spread; None where no points are seen
+
+    def _headline(self) -> str:
+        errors = (one for one in (self.position, self.orientation) if one is not None)
+        told = (f"{one.validated_before:.3g} -> {one.validated_after:.3g} {one.unit}" for one in errors)
+        return f"{self.verdict}; level {self.level}, {len(self.parameters)} parameters; held out: {', '.join(told)}"
 
     @property
     def model(self) -> RobotModel:

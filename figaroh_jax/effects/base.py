@@ -330,6 +330,11 @@ class Effect(eqx.Module):
     # methods as Python has them: of each, whenever it is asked for, equinox makes a module, which takes 50 us
     __getattribute__ = object.__getattribute__
 
+    def __repr__(self) -> str:
+        fields = ((f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.name != "at")
+        told = "".join(f", {name}={_short(value)}" for name, value in fields if value is not None)
+        return f"{type(self).__name__}(at={_short(self.at)}{told})"
+
     def torque(self, motion: Motion) -> Float[Array, "samples *rows"]:
         """Torque added, N m or N: `(samples,)` at a joint, `(samples, 2)` at a pair, else `(samples, nv)`."""
         q, v, a = motion.position, motion.velocity, motion.acceleration
@@ -446,6 +451,15 @@ class Effect(eqx.Module):
         if self.acts_on in ("link", "robot"):
             return torque
         return jnp.zeros_like(motion.velocity).at[:, self.places].add(torque.reshape(torque.shape[0], -1))
+
+
+def _short(value: Any) -> str:
+    """A number in six digits, a place by its indices, all else by its shapes."""
+    if isinstance(value, Place) or (isinstance(value, np.ndarray) and value.dtype.kind == "i" and value.size <= 2):
+        return str(tuple(np.asarray(value).tolist()))
+    if isinstance(value, Tracer) or np.ndim(value) or not isinstance(value, (int, float, jax.Array, np.ndarray)):
+        return eqx.tree_pformat(value)
+    return f"{float(value):.6g}"
 
 
 class JointEffect(Effect):

@@ -17,6 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -40,6 +41,7 @@ __all__ = [
     "with_torque",
 ]
 
+_SHOWN = 12  # effects that a model's text lists
 _NEWTON_STEPS = 12  # a load-dependent friction makes the torque piecewise affine in the acceleration: 2 or 3 are used
 
 
@@ -53,6 +55,11 @@ class ExtendedModel(eqx.Module):
     robot: RobotModel
     effects: tuple[Effect, ...]
     width: Float[Array | np.ndarray, " nv"]  # half width of a reversal of the joints' dry friction, rad/s or m/s
+
+    def __repr__(self) -> str:
+        shown = [f"  {one.name} {' '.join(_where(self.robot, one))}: {one}" for one in self.effects[:_SHOWN]]
+        more = [f"  ... and {len(self.effects) - _SHOWN} more"] if len(self.effects) > _SHOWN else []
+        return "\n".join([f"ExtendedModel of {self.robot}; {len(self.effects)} effects", *shown, *more])
 
     @in_float64
     def inverse_dynamics(
@@ -71,6 +78,12 @@ class ExtendedModel(eqx.Module):
         At v = 0 dry friction is taken as zero: a joint that sticks is the business of `simulate`.
         """
         return _forward_dynamics(opened(self), *states(self.robot, q=q, v=v, tau=tau))
+
+
+def _where(robot: RobotModel, effect: Effect) -> list[str]:
+    """Names of the place, where it is one that is known."""
+    names = robot.link_names if effect.acts_on == "link" else robot.dof_names
+    return [] if isinstance(effect.at, Tracer) or np.ndim(effect.at) != 1 else [names[k] for k in np.asarray(effect.at)]
 
 
 def extend(

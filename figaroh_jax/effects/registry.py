@@ -19,6 +19,9 @@ class UnknownEffect(InputError, KeyError):
 class _Named(dict[str, type[Effect]]):
     """Effects by their names; a name that is not there is refused with the nearest one."""
 
+    def __repr__(self) -> str:
+        return f"{len(self)} effects: {', '.join(self)}"
+
     def __missing__(self, name: str) -> NoReturn:
         raise UnknownEffect(f"no effect '{name}' in the catalogue{nearest(name, self)}")
 

@@ -46,6 +46,9 @@ class Basis(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)  # of the kept parameters
     expressions: tuple[str, ...] = eqx.field(static=True)  # with what is grouped into them
 
+    def __repr__(self) -> str:
+        return f"Basis of {len(self.names)} base parameters: {', '.join(self.names)}"
+
 
 class LinearFit(eqx.Module):
     """Base parameters of one fit; of many under `jax.vmap`.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["HIDDEN", "Fit", "numbers"]
 
+SHOWN = 24  # numbers that the text of a fit lists
 HIDDEN = 1e-6  # share of a number in directions that nothing determines, above which it is not determined
 
 
@@ -31,8 +33,9 @@ class Fit(eqx.Module):
     `model` is the model with the fitted numbers in it, `parameters` each of them by name with value, sigma and unit;
     `values` (numbers,) are their changes from the model that was given, `covariance` (numbers, numbers) and
     `std` what the rows tell of them, `rank` how many directions data and prior determine. `cost` is half of the squares
-    of all rows, `rows` the weighted residual. `result` is `optimistix.RESULTS.successful` or why not, `reason` the
-    same in words.
+    of all rows, `rows` the weighted residual. Covariance and `std` have no gradient (zero): where a deviation is to be
+    made small, take `expected_std`, or invert J'J of the Jacobian of `residual`. `result` is
+    `optimistix.RESULTS.successful` or why not, `reason` the same in words.
     """
 
     model: ExtendedModel  # with the numbers in it
@@ -48,6 +51,21 @@ class Fit(eqx.Module):
     free: Free = eqx.field(static=True)
     failure: str = eqx.field(static=True, default="")  # why another solver did not end well
 
+    def __repr__(self) -> str:
+        robot, names, batch = self.model.robot.name, self.free.names, np.shape(self.values)[:-1]
+        head = f"Fit of '{robot}': {len(names)} numbers"
+        if batch or isinstance(self.values, Tracer):
+            shown = [f"  {name}" for name in names[:SHOWN]]
+            head += f", batch {batch}, see `values`, `std` and `model`" if batch else ", traced"
+        else:
+            rows = np.asarray(self.rows)
+            head += f", rank {int(self.rank)}"
+            head += f", RMS of {rows.size} rows {np.sqrt(np.mean(rows**2)):.4g}" if rows.size else ""
+            head += f"; it did not end well: {self.reason}" if self.reason else ""
+            shown = [f"  {name}: {value}" for name, value in islice(self.parameters.items(), SHOWN)]
+        more = [f"  ... and {len(names) - SHOWN} more, see `parameters`"] if len(names) > SHOWN else []
+        return "\n".join([head, *shown, *more])
+
     @property
     def result(self) -> optimistix.RESULTS:
         """`optimistix.RESULTS.successful`, or why not."""
@@ -62,6 +80,11 @@ class Fit(eqx.Module):
         """Why the solver did not end well, in words; empty where it did."""
         import optimistix
 
+        if isinstance(self.values, Tracer) or np.ndim(self.values) != 1:
+            raise InputError(
+                "Fit.reason is of one fit: under jit, grad or vmap, and of a batch, take `result`, which has one each:"
+                " `result == optimistix.RESULTS.successful`"
+            )
         if self.failure or self.outcome is None:
             return self.failure
         return "" if self.outcome == optimistix.RESULTS.successful else optimistix.RESULTS[self.outcome]

@@ -30,7 +30,7 @@ Cause = tuple[str, Sequence[str], Mapping[str, float]]  # effect, place, sizes
 Progress = Callable[[str, float], None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Design:
     """Motions designed one after another, and what they tell."""
 
@@ -44,6 +44,10 @@ class Design:
     scaled_condition: float  # the same with columns of length one
     separated: tuple[Separated, ...] = ()  # causes told apart by all motions together
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        told = f"{self.learned.rank} base parameters, logdet {self.logdet:.4g}, condition {self.condition:.3g}"
+        return f"Design: {len(self.stages)} motions, limits {'met' if self.met else 'NOT met'}; {told}"
 
     @property
     def logdet(self) -> float:

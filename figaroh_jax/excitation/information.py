@@ -54,6 +54,10 @@ class Learned(eqx.Module):
     expressions: tuple[str, ...] = eqx.field(static=True)  # base parameters in names
     held: tuple[int, ...] = eqx.field(static=True, default=())  # coordinates that stand still
 
+    def __repr__(self) -> str:
+        names = ", ".join(self.names[k] for k in self.independent)
+        return f"Learned: {self.rank} base parameters of '{self.robot.name}': {names}"
+
     @property
     def rank(self) -> int:
         """Number of base parameters, friction with them."""

@@ -117,7 +117,7 @@ class _Parameter(NamedTuple):
     unit: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PostureDesign:
     """Postures in the order in which they are to be measured, and what they tell."""
 
@@ -132,6 +132,10 @@ class PostureDesign:
     random_logdet: float  # median of random choices
     candidates: int
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        told = f"{len(self.parameters)} parameters, {self.efficiency:.1%} of the bound"
+        return f"PostureDesign: {len(self.position)} postures of '{self.model.name}'; {told}"
 
     @property
     def efficiency(self) -> float:

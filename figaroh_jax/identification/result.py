@@ -69,7 +69,7 @@ class Quality:
         return float(np.sqrt(np.nanmean(self.rms**2))) if np.isfinite(self.rms).any() else math.nan
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Identification:
     """The fitted robot, what can be trusted of it, and how well it predicts."""
 
@@ -97,6 +97,12 @@ class Identification:
     notes: tuple[str, ...] = ()
     prismatic: tuple[bool, ...] = field(default=())
     band: float | None = None  # Hz, that positions were taken down to (`prepare`): predictions want the same
+
+    def __repr__(self) -> str:
+        rows = zip(self.joints, self.nominal.relative, self.fit.relative, self.validated.relative, strict=True)
+        told = [f"  {joint}: {a:.2%} -> {b:.2%}, cross-validated {c:.2%}" for joint, a, b, c in rows]
+        head = f"Identification: {self.rank} of {self.structural_rank} base parameters, {self.method}"
+        return "\n".join([f"{head}; error of the torque, nominal -> fitted:", *told])
 
     @property
     def model(self) -> ExtendedModel:

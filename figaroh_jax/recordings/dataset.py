@@ -64,7 +64,7 @@ class Driven(NamedTuple):
     gain: float | None = None  # of a command that is a torque: that of the joint (N m or N) per unit
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Recording:
     """One recording on the joint side: rad and N m, or m and N for prismatic joints; see `figaroh_jax.recording`.
 
@@ -88,6 +88,12 @@ class Recording:
     stamps: Float[np.ndarray, " all"] | None = None  # s, of all rows of the file, where some are left out or lack
     clock: Float[np.ndarray, " all"] | None = None  # s, when these rows were: the same but where rows lack
     wild: str = ""  # which rows no robot made, and what was done (see `wild`)
+
+    def __repr__(self) -> str:
+        held = {key: getattr(self, key) for key in ("position", "velocity", "torque", "command")}
+        arrays = ", ".join(f"{key} {value.shape}" for key, value in held.items() if value is not None)
+        span = f"{len(self.time)} samples in {float(np.ptp(self.time)) if len(self.time) else 0.0:.4g} s"
+        return f"Recording '{self.name}' ({self.role}): {span}; {arrays}; joints {', '.join(self.joints)}"
 
 
 def read_recordings(

@@ -36,7 +36,7 @@ _LOOSE = 1e-2  # how far a rotation or a quaternion may be off by rounding
 _MOST_ANGLE = 6.5  # rad, of an orientation: a turn and a little
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PoseRecording:
     """Postures in the order in which they were measured, and what the device saw at each."""
 
@@ -56,6 +56,11 @@ class PoseRecording:
     notes: tuple[str, ...] = ()
     device: Device | None = None  # of kind "own"
     carried: bool = False  # poses of a camera that the robot carries: told by how it sees what stands in the origin
+
+    def __repr__(self) -> str:
+        way = f"{self.kind} {np.shape(self.values)} from {self.base_frame} to {self.tool_frame}"
+        unknown = f"; unknown: {', '.join(self.unknown)}" if self.unknown else ""
+        return f"PoseRecording '{self.name}' ({self.role}): {len(self.position)} postures; {way}{unknown}"
 
 
 def read_pose_recordings(task: Task, model: RobotModel) -> tuple[PoseRecording, ...]:

@@ -131,6 +131,13 @@ class RobotModel(eqx.Module):
 
     __getattribute__ = object.__getattribute__  # methods as Python has them: equinox makes a module of each
 
+    def __repr__(self) -> str:
+        names = self.joint_names[:8] + ("...",) * (len(self.joint_names) > 8)
+        batch = np.shape(self.gravity)[:-1]
+        several = f"{batch} of " if batch else ""
+        moving = f"{several}{len(self.joint_names)} joints ({', '.join(names)})"
+        return f"RobotModel '{self.name}': {moving}, nq {self.nq}, nv {self.nv}, {len(self.frames)} frames"
+
     @property
     def nv(self) -> int:
         """Number of coordinates (columns of v, a, tau)."""

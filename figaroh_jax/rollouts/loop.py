@@ -187,6 +187,11 @@ class Loop(eqx.Module):
     pairs: Pairs | None = None
     effects: tuple[Effect, ...] = ()  # that act by their own torque beside the joints' numbers (`own`)
 
+    def __repr__(self) -> str:
+        drives, more = ", ".join(self.drives.names) or "none", "".join(f"\n  {effect}" for effect in self.effects)
+        scheme = f"steps of {self.dt} s ({self.integrator}), {self.law} friction"
+        return f"Loop of {self.robot}; drives: {drives}; {scheme}{more}"
+
     def with_effects(self, *effects: Effect) -> Loop:
         """The loop with these effects in place of those it had: yours, or any of the catalogue with a `torque`.
 

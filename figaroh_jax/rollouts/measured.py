@@ -48,6 +48,9 @@ class RolloutData(eqx.Module):
     change: Float[Leaf, " open"]  # of the drives' numbers that are open
     drives: tuple[str, ...] = eqx.field(static=True, default=())
 
+    def __repr__(self) -> str:
+        return f"RolloutData: readings (rows, encoders, recordings) {np.shape(self.windows.reading)}\n  {self.loop}"
+
     @property
     def model(self) -> ExtendedModel:
         """The loop's robot with what acts at its joints as effects: where a fit begins."""
