@@ -9,9 +9,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
+import pytest
 import robots
 
+import figaroh_jax as fj
 from figaroh_jax.effects.base import JointEffect, Scalar, amplitude
 from figaroh_jax.effects.catalogue import register
 from figaroh_jax.effects.kinematic import CATALOGUE, Postures, axis_twist, columns_of
@@ -62,3 +67,42 @@ def test_an_effect_of_ones_own_that_errs_in_position_is_one_of_postures(tmp_path
     # the joint stands behind its reading by the error
     turn = axis_twist(model, 1)[:, None] * -np.exp(-(q[:, 1] ** 2))
     np.testing.assert_allclose(field(postures), turn, rtol=0, atol=1e-15)
+
+
+class Net(fj.JointEffect):
+    """Friction that a network learns: its activation is a function, which is no array."""
+
+    name, title, equation = "net_friction", "a network", "net(v)"
+    net: Any = None
+
+    def torque(self, motion: fj.Motion) -> Any:
+        return jax.vmap(self.net)(self.here(motion.velocity)[:, None])[:, 0]
+
+
+def test_a_network_of_equinox_is_an_effect_and_learns_from_the_residual():
+    robot, net = fj.load_urdf(fj.DEMO), eqx.nn.MLP(1, 1, 4, 1, activation=jnp.tanh, key=jax.random.key(0))
+    model = fj.extend(robot, fj.place(Net, fj.extend(robot), "elbow", net=net))
+    q = np.sin(np.arange(200)[:, None] / 25.0 + np.arange(4))
+    data = fj.torque_data(robot, fj.recording(q=q, tau=0 * q, rate=100), fj.Preprocess(cutoff=10))
+
+    def cost(net: Any) -> Any:
+        return (fj.residual(eqx.tree_at(lambda m: m.effects[0].net, model, net), data) ** 2).mean()
+
+    with jax.enable_x64(True):
+        slope, h = eqx.filter_grad(cost)(net).layers[1].weight, 1e-4
+        moved = [eqx.tree_at(lambda n: n.layers[1].weight, net, net.layers[1].weight + k * h) for k in (1, -1)]
+        difference = (float(cost(moved[0])) - float(cost(moved[1]))) / (2 * h)
+        assert float(slope.sum()) == pytest.approx(difference, rel=1e-5)
+        added = model.inverse_dynamics(q, q, q) - fj.inverse_dynamics(robot, q, q, q)
+        assert np.allclose(added[:, 2], jax.vmap(net)(jnp.asarray(q[:, 2:3]))[:, 0])
+
+
+def test_what_place_takes_is_said():
+    robot, effect = fj.load_urdf(fj.DEMO), fj.CATALOGUE["viscous_friction"]
+    for wrong, message in (
+        (lambda: fj.place(effect, ["elbow"]), "got list in place of the model"),
+        (lambda: fj.place(effect, robot, 2), "takes names, got '2'; joints are waist, shoulder"),  # pyright: ignore
+        (lambda: fj.place(Net, robot, "elbow", nets=1), "no parameter 'nets'; known: net"),
+    ):
+        with pytest.raises(fj.InputError, match=message):
+            wrong()

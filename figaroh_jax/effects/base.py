@@ -21,7 +21,7 @@ bounds from their grid. Torques are those of the drive: what has to be added to 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
@@ -498,10 +498,11 @@ def smooth_sign(
     return (velocity / (wider + 1e-9)).clip(-1.0, 1.0)
 
 
-def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **parameters: Scalar) -> Effect:
+def place(effect: type[Effect], model: Any, at: Sequence[str] | str = (), **parameters: Any) -> Effect:
     """The effect at the joints, pair or link named in `at`, with parameters by name (the others at their default).
 
-    A parameter is a number, also one that `jax.grad`, `jax.vmap` or `jax.jit` traces.
+    A parameter is a number, also one that `jax.grad`, `jax.vmap` or `jax.jit` traces. What an effect of yours has as
+    further fields (a network of equinox) is taken as it is.
 
     >>> import figaroh_jax as fj
     >>> robot = fj.load_urdf(fj.DEMO)
@@ -514,17 +515,28 @@ def place(effect: type[Effect], model: RobotModel, at: Sequence[str] = (), **par
         raise InputError(
             f"place takes an effect, then the model: fj.place(fj.CATALOGUE[name], model, at); got {told} first"
         )
+    model = getattr(model, "robot", model)  # of an extended model
+    if not isinstance(model, RobotModel):
+        raise InputError(
+            "place takes an effect, then the model: fj.place(fj.CATALOGUE[name], model, at); got"
+            f" {type(model).__name__} in place of the model"
+        )
     wanted = {"joint": 1, "pair": 2, "link": 1, "robot": 0}[effect.acts_on]
-    at = [at] if isinstance(at, str) else [*(at or ())]
+    at = [at] if isinstance(at, str) or not isinstance(at, Iterable) else [*at]
+    for one in at:
+        if not isinstance(one, str):
+            raise InputError(f"`at` takes names, got {str(one)[:60]!r}; joints are {', '.join(model.dof_names)}")
     if len(at) != wanted:
         raise InputError(f"effect '{effect.name}' acts on a {effect.acts_on}: `at` takes {wanted} names, got {len(at)}")
     index = model.link_index if effect.acts_on == "link" else model.joint_index
-    unknown = set(parameters) - set(effect.parameters())
+    numbers, fields = effect.parameters(), [f.name for f in dataclasses.fields(effect) if f.name != "at"]
+    unknown = set(parameters) - set(fields)
     if unknown:
-        known = ", ".join(effect.parameters())
+        known = ", ".join(numbers or fields)
         raise InputError(f"effect '{effect.name}' has no parameter '{sorted(unknown)[0]}'; known: {known}")
     indices = np.asarray([index(name) for name in at], dtype=np.int64)
-    return effect(indices, **{name: _number(effect, name, value) for name, value in parameters.items()})
+    given = {name: _number(effect, name, x) if name in numbers else x for name, x in parameters.items()}
+    return effect(indices, **given)
 
 
 def _number(effect: type[Effect], name: str, value: Any) -> Any:
@@ -548,7 +560,7 @@ def fixed(effect: Effect) -> Effect:
 
 def movable(effect: Effect) -> Effect:
     """The effect with its place an array: programs then serve every place, and `jax.vmap` maps over places."""
-    return eqx.tree_at(lambda e: e.at, effect, effect.places) if isinstance(effect.at, Place) else effect
+    return changed(effect, at=effect.places) if isinstance(effect.at, Place) else effect
 
 
 def exact(effect: T) -> T:

@@ -26,7 +26,7 @@ from ..errors import InputError, check_real
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.kinematics import states
 from ..rigid.model import RobotModel
-from .base import Effect, Motion, exact, fixed, movable
+from .base import Effect, Motion, changed, exact, fixed, movable
 
 __all__ = [
     "ExtendedModel",
@@ -163,7 +163,7 @@ def read_sensors(extended: ExtendedModel, time: Array, q: Array, v: Array, a: Ar
     return read_torque(extended.effects, with_torque(extended.effects, motion, load))
 
 
-@jax.jit
+@eqx.filter_jit
 def _inverse_dynamics(extended: ExtendedModel, q: Array, v: Array, a: Array) -> Array:
     robot, shape = changed_robot(extended), v.shape
     q, v, a = (x.reshape(-1, x.shape[-1]) for x in (q, v, a))
@@ -172,7 +172,7 @@ def _inverse_dynamics(extended: ExtendedModel, q: Array, v: Array, a: Array) -> 
     return with_torque(extended.effects, motion, load).total.reshape(shape)
 
 
-@jax.jit
+@eqx.filter_jit
 def _forward_dynamics(extended: ExtendedModel, q: Array, v: Array, tau: Array) -> Array:
     flat = (x.reshape(-1, x.shape[-1]) for x in (q, v, tau))
     return jax.vmap(_solve_acceleration, (None, 0, 0, 0))(extended, *flat).reshape(v.shape)
@@ -207,7 +207,7 @@ def _newton(excess: Callable[[Array], Array], start: Array) -> Array:
 
 def opened(extended: ExtendedModel) -> ExtendedModel:
     """The model with the places of its effects as arrays: one compiled program for all places."""
-    return eqx.tree_at(lambda m: m.effects, extended, tuple(movable(effect) for effect in extended.effects))
+    return changed(extended, effects=tuple(movable(effect) for effect in extended.effects))
 
 
 def changed_robot(extended: ExtendedModel) -> RobotModel:
@@ -228,7 +228,7 @@ def with_torque(effects: tuple[Effect, ...], motion: Motion, load: Float[Array, 
 
 
 # compiled once for each kind of effect, whatever the joint: a model of other effects then needs no new compilation
-@jax.jit
+@eqx.filter_jit
 def _joint_torque(effect: Effect, motion: Motion) -> Float[Array, "samples nv"]:
     return effect.joint_torque(motion)
 
@@ -256,12 +256,12 @@ def read_torque(effects: tuple[Effect, ...], motion: Motion) -> Float[Array, "sa
     return torque
 
 
-@jax.jit
+@eqx.filter_jit
 def _joint_torque_error(effect: Effect, motion: Motion) -> Float[Array, "samples nv"]:
     return effect.in_joints(effect.torque_error(motion), motion)
 
 
-@jax.jit
+@eqx.filter_jit
 def _respond(effect: Effect, signal: Float[Array, "samples nv"], dt: Float[Array, ""] | float) -> Array:
     """Response to a record: exactly to the line between its ends, in the frequency domain to the rest.
 
