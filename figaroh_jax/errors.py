@@ -62,6 +62,15 @@ def check_list(name: str, given: Any) -> None:
         raise InputError(f"{name} is one {type(given).__name__}; a list is expected, of one too: [{name[:-1]}]")
 
 
+def check_each(name: str, given: Any, kind: type | tuple[type, ...], hint: str) -> None:
+    """Refuse what is not a list of things of one kind; the message ends in how one is made."""
+    check_list(name, given)
+    for one in given:
+        if not isinstance(one, kind):
+            named = " or a ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
+            raise InputError(f"{name}: a {named} is expected, got a {type(one).__name__}: {hint}")
+
+
 def check_names(name: str, given: Any) -> None:
     """Refuse one text where a list of names is expected: its letters would be taken for names."""
     if isinstance(given, str):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, overload
 
-from .errors import InputError, check_list
+from .errors import InputError, check_each
 from .formats.config import Preprocess, Task
 from .recordings.checks import Checked, checked_recordings
 from .recordings.posture_checks import check_pose_recordings
@@ -102,9 +102,10 @@ def diagnose(
     >>> found.verdict
     'named'
     """
+    from .recordings.dataset import Recording
     from .recordings.poses import PoseRecording
 
-    check_list("recordings", recordings)
+    check_each("recordings", recordings, (Recording, PoseRecording), "`recording` and `postures` make them of arrays")
     postures = [one for one in recordings if isinstance(one, PoseRecording)]
     if postures:
         from .calibration.kinematic_diagnosis import diagnose_poses

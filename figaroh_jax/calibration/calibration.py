@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..effects.kinematic import HISTORY
-from ..errors import InputError, check_list, nearest
+from ..errors import InputError, check_each, nearest
 from ..estimation import marginal
 from ..estimation.gravity import without_far_masses
 from ..estimation.posegroups import Measured, assemble, postures_of
@@ -94,7 +94,7 @@ def calibrate(
     >>> round(found.solution.parameters["joint_offset shoulder"].value, 4)
     0.02
     """
-    check_list("recordings", recordings)
+    check_each("recordings", recordings, PoseRecording, "`postures` makes one of arrays")
     notes = check_pose_recordings(None, model, recordings)
     found = _calibrated(model, recordings, forbid, progress, level, priors)
     return replace(found, notes=(*notes, *found.notes))

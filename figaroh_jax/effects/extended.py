@@ -31,6 +31,7 @@ from .base import Effect, Motion, changed, exact, fixed, movable
 __all__ = [
     "ExtendedModel",
     "changed_robot",
+    "check_period",
     "extend",
     "opened",
     "predict",
@@ -100,6 +101,16 @@ def extend(
     >>> model.effects[0].name
     'viscous_friction'
     """
+    if not isinstance(model, (RobotModel, ExtendedModel)):
+        raise InputError(
+            f"model is of type {type(model).__name__}; a RobotModel or an ExtendedModel is expected, first"
+        )
+    for one in effects:
+        if not isinstance(one, Effect):
+            told = one.__name__ if isinstance(one, type) else type(one).__name__
+            raise InputError(
+                f"effects are those that `place` makes, one after the other: extend(model, *list); got {told}"
+            )
     robot, present = (model.robot, model.effects) if isinstance(model, ExtendedModel) else (model, ())
     if width is None:
         width = model.width if isinstance(model, ExtendedModel) else 0.0
@@ -114,7 +125,7 @@ def extend(
 
 @in_float64
 def predict(
-    extended: ExtendedModel,
+    extended: ExtendedModel | RobotModel,
     time: Float[ArrayLike, " samples"],
     position: Float[ArrayLike, "samples nv"],
     velocity: Float[ArrayLike, "samples nv"],
@@ -134,13 +145,21 @@ def predict(
     >>> fj.predict(model, t, still, still, still, 0.01).shape
     (50, 4)
     """
+    extended = extended if isinstance(extended, ExtendedModel) else extend(extended)
     require_single_axes(extended.robot, "a record of sensors")
+    check_period(dt)
     check_real("time", time)
     motion = states(extended.robot, position=position, velocity=velocity, acceleration=acceleration)
     if motion[0].ndim != 2 or motion[0].shape[0] < 5:
         raise InputError(f"a record of 5 samples or more is needed, got the shape {motion[0].shape}")
     q, v, a = motion
     return read_sensors(extended, jnp.asarray(time, jnp.float64), q, v, a, jnp.float64(dt))
+
+
+def check_period(dt: Any) -> None:
+    """Raise `InputError` where a step or a period (s) is known and not above zero."""
+    if not isinstance(dt, Tracer) and not float(dt) > 0:
+        raise InputError(f"dt is {dt}; the time from one sample to the next is expected, above zero, in s")
 
 
 def require_single_axes(robot: RobotModel, what: str) -> None:

@@ -23,7 +23,17 @@ from ..rigid.dynamics import inverse_dynamics
 from ..rigid.kinematics import states
 from ..rigid.model import RobotModel
 from .base import Effect, Motion
-from .extended import ExtendedModel, changed_robot, opened, read_position, read_torque, require_single_axes, with_torque
+from .extended import (
+    ExtendedModel,
+    changed_robot,
+    check_period,
+    extend,
+    opened,
+    read_position,
+    read_torque,
+    require_single_axes,
+    with_torque,
+)
 
 __all__ = ["Command", "Reversal", "Simulation", "simulate"]
 
@@ -47,7 +57,7 @@ class Simulation(eqx.Module):
 
 @in_float64
 def simulate(
-    extended: ExtendedModel,
+    extended: ExtendedModel | RobotModel,
     command: Float[ArrayLike, "steps nv"] | Command,
     position: Float[ArrayLike, " nv"],
     velocity: Float[ArrayLike, " nv"],
@@ -69,7 +79,9 @@ def simulate(
     >>> fj.simulate(model, np.zeros((20, 4)), np.zeros(4), np.zeros(4), 1e-3).position.shape
     (20, 4)
     """
+    extended = extended if isinstance(extended, ExtendedModel) else extend(extended)
     require_single_axes(extended.robot, "a simulation")
+    check_period(dt)
     q, v = states(extended.robot, position=position, velocity=velocity)
     if q.ndim != 1:
         raise InputError(f"position has shape {q.shape}; a simulation starts from one state, map it over several")

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Shaped
 from ..compiled.precision import in_float64
 from ..effects.extended import ExtendedModel, changed_robot, extend, opened, read_position, read_sensors
 from ..effects.kinematic import PostureMotion, Postures, twists_of
-from ..errors import InputError
+from ..errors import InputError, check_each
 from ..recordings.checks import check_columns, position_findings, report_findings
 from ..recordings.dataset import Recording
 from ..recordings.devices import Device
@@ -87,6 +87,12 @@ class TorqueData(eqx.Module):
     def predicted(self, model: ExtendedModel) -> Float[Array, "n M nv"]:
         """Rows of the model's torque, as the sensors read it, N m or N."""
         model = opened(model)
+        for name in ("position", "velocity", "acceleration"):
+            if np.shape(getattr(self, name))[:2] != np.shape(self.time):
+                raise InputError(
+                    f"data.{name} has shape {np.shape(getattr(self, name))}, but data.time {np.shape(self.time)}: give"
+                    " another motion at these instants"
+                )
         axes = (0, 0, 0, 0, None if self.carried is None else 0)
         motion = self.time, self.position, self.velocity, self.acceleration, self.carried
         torque = jax.vmap(lambda *one: self._torque(model, *one), in_axes=axes)(*(_traceable(x) for x in motion))
@@ -221,8 +227,10 @@ def torque_data(
     from ..formats.config import Preprocess
     from .regression import BLOCK, BLOCK_PERIODS  # a calibration has no use for it
 
-    robot = model.robot if isinstance(model, ExtendedModel) else model
-    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    robot = (model if isinstance(model, ExtendedModel) else extend(model)).robot
+    given = [recordings] if isinstance(recordings, Recording) else recordings
+    check_each("recordings", given, Recording, "`recording` makes one of arrays")
+    check_each("preprocess", [preprocess or Preprocess()], Preprocess, "Preprocess(cutoff=15), in Hz, say")
     fitted = [one for one in given if one.role == "fit"]
     lacking = next((one for one in fitted if one.torque is None), None)
     if not fitted or lacking is not None:

@@ -35,6 +35,7 @@ from .solution import Fit
 
 __all__ = ["Fit", "fit"]
 
+_SOLVERS = (optimistix.AbstractLeastSquaresSolver, optimistix.AbstractMinimiser)
 NULL = 1e-12  # of the largest eigenvalue of the information: below it a direction is not determined
 STATIONARY = 1e-5  # share of the gradient at the start that may be left where a fit within limits has converged
 SEVERAL = 8  # devices or sets of recordings in a small problem
@@ -108,6 +109,13 @@ def fit(
     0.02
     """
     whole = model if isinstance(model, ExtendedModel) else extend(model)
+    for name, given in (("prior", prior or {}), ("bounds", bounds or {})):
+        if not isinstance(given, Mapping):
+            raise InputError(f"{name} is {given!r}; a mapping from names is expected, {{'effects': ...}}")
+    if solver is not None and not isinstance(solver, _SOLVERS):
+        raise InputError(
+            f"solver is {solver!r}; one of optimistix is expected: optimistix.LevenbergMarquardt(1e-8, 1e-8)"
+        )
     parts = as_data(whole, data)
     chosen = chosen_of(whole, parts, free)
     precision = _precision(chosen, whole, prior or {}) * chosen.sizes**2
@@ -270,7 +278,10 @@ def _group(robot: RobotModel, one: PoseData, columns: list[tuple[int, np.ndarray
 def _limits(free: Free, bounds: Mapping[str, tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper limit of each number in its size."""
     lower, upper = np.full((2, len(free.names)), np.inf) * [[-1.0], [1.0]]
-    for key, (low, high) in bounds.items():
+    for key, pair in bounds.items():
+        if np.shape(pair) != (2,):
+            raise InputError(f"bounds: '{key}' has {pair!r}; a pair is expected, lower and upper")
+        low, high = pair
         mine = np.array([name == key or name.startswith(f"{key} ") for name in free.names])
         if not mine.any():
             raise InputError(f"bounds: nothing free is called '{key}'; free are {', '.join(free.names[:12])}")

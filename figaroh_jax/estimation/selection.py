@@ -77,7 +77,7 @@ def select(
     whole = model if isinstance(model, ExtendedModel) else extend(model)
     parts, left = as_data(whole, data), list(candidates)
     if not left or not all(isinstance(one, Effect) for one in left):
-        raise InputError("candidates: effects at their places are expected, as `place` makes them")
+        raise InputError("candidates: effects at their places are expected: [place(effect, model, ['elbow']), ...]")
     wanted = (
         {kind: True for kind in ([free] if isinstance(free, str) else free)} if not isinstance(free, dict) else free
     )

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from ..effects.base import Effect
 from ..effects.friction import CoulombFriction
 from ..effects.plausibility import implausible
-from ..errors import InputError, check_list, check_names, nearest
+from ..errors import InputError, check_each, check_names, nearest
 from ..estimation.base_parameters import BaseParameters, base_parameters, essential
 from ..estimation.columns import friction_terms, structural_columns
 from ..estimation.conic import Body, NotConverged
@@ -178,7 +178,8 @@ def identify(
     """
     from ..formats.config import Baseline, Preprocess
 
-    check_list("recordings", recordings)
+    check_each("recordings", recordings, Recording, "`recording` makes one of arrays")
+    check_each("preprocess", [preprocess or Preprocess()], Preprocess, "Preprocess(cutoff=15), in Hz, say")
     backend = as_backend(model)
     model = backend.robot
     warned = check_recordings(None, model, recordings) if check else ()

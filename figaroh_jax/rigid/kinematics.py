@@ -296,6 +296,13 @@ def check_shapes(model: RobotModel, **arrays: Float[ArrayLike, "..."]) -> None:
 
 def _check_model(model: Any) -> None:
     if isinstance(model, RobotModel):
+        joints = len(model.joints)
+        for name, shape in (("inertia", (joints, 10)), ("gravity", (3,)), ("placement", (joints, 4, 4))):
+            if np.shape(getattr(model, name)) != shape:
+                raise InputError(
+                    f"model.{name} has shape {np.shape(getattr(model, name))}; robot '{model.name}' needs {shape}: map"
+                    " several robots by jax.vmap"
+                )
         return
     if isinstance(getattr(model, "robot", None), RobotModel):
         own = f"the {type(model).__name__} holds one: give its `.robot`, or call what it can do itself"

@@ -48,6 +48,10 @@ def rollout(
     >>> fj.rollout(loop, np.zeros((20, 1)), np.zeros(1)).reading.shape
     (20, 1)
     """
+    if not isinstance(loop, Loop):
+        raise InputError(
+            f"loop is of type {type(loop).__name__}; `load_loop` makes one of a robot's file and its drives"
+        )
     with jax.enable_x64(True):
         u = jnp.asarray(command, jnp.float64)
         count = len(loop.drives.names)
