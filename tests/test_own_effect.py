@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import os
 import subprocess
 import sys
@@ -106,3 +107,42 @@ def test_what_place_takes_is_said():
     ):
         with pytest.raises(fj.InputError, match=message):
             wrong()
+
+
+class Bristle(fj.JointEffect):
+    """Friction with a state, told by its `step` alone."""
+
+    name, title, equation = "own_bristle", "a bristle", "force z, z' = v / distance (1 - z s(v))"
+    force: float = fj.amplitude("N m")
+    distance: float = fj.shape("rad", (0.02, 0.1), (0.001, 1.0))
+    memory: Any = eqx.field(default=None, kw_only=True)
+
+    def torque(self, motion: fj.Motion) -> Any:
+        return self.force * self.memory
+
+    def step(self, velocity: Any, dt: Any) -> Bristle:
+        end, stays = jnp.sign(velocity[self.at[0]]), jnp.exp(-jnp.abs(velocity[self.at[0]]) * dt / self.distance)
+        return dataclasses.replace(self, memory=end + (self.memory - end) * stays)
+
+    def begin(self, velocity: Any) -> Any:
+        return 0.0 * velocity[0]
+
+
+def test_an_effect_with_a_state_follows_its_step_along_a_record():
+    robot, t = fj.load_urdf(fj.DEMO), np.arange(300)[:, None] / 100.0
+    q, v = 0.3 * np.sin(2 * t + np.arange(4)), 0.6 * np.cos(2 * t + np.arange(4))
+    model = fj.extend(robot, fj.place(Bristle, robot, "elbow", force=2.0, distance=0.05))
+    z, expected = 0.0, [0.0]
+    for rate in v[1:, 2]:
+        z = np.sign(rate) + (z - np.sign(rate)) * np.exp(-abs(rate) * 0.01 / 0.05)
+        expected.append(2.0 * z)
+    added = [np.asarray(fj.predict(one, t[:, 0], q, v, -4 * q, 0.01))[:, 2] for one in (model, robot)]
+    assert np.allclose(added[0] - added[1], expected, atol=1e-12)
+
+
+def test_a_state_that_would_stand_still_is_refused():
+    class Frozen(Bristle):
+        memory: Any = 0.0
+
+    with pytest.raises(fj.InputError, match="has a `step`, so its state is a field `memory: Any"):
+        fj.place(Frozen, fj.load_urdf(fj.DEMO), "elbow")

@@ -10,7 +10,7 @@ An effect has whatever forms it has. Identification, diagnosis, export and simul
 | what a torque sensor reads beside the truth | `torque_error` | torque-level diagnosis, simulated sensors |
 | what a torque sensor makes of a frequency | `torque_response` | torque-level diagnosis, simulated sensors |
 | what a drive makes of the torque that it is to give | `delivered` | simulation |
-| a state of its own from instant to instant | `step` | simulation; `torque` follows it along a record |
+| a state of its own from instant to instant | `step` | simulation; along a record, before `torque` is asked for |
 | twist on a link | `twist` | pose calibration |
 | native elements of MJCF and URDF | `native` | export |
 
@@ -23,7 +23,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
-from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -373,8 +373,32 @@ class Effect(eqx.Module):
         raise NotImplementedError(f"{self.name} leaves the torque as it is")
 
     def step(self, velocity: Float[Array, " nv"], dt: Float[Array, ""]) -> Effect:
-        """The effect with its state after `dt` seconds at a velocity, for effects that have a state (`memory`)."""
+        """The effect with its state after `dt` seconds at a velocity, for effects that have a state.
+
+        The state is the field `memory: Any = eqx.field(default=None, kw_only=True)`; the library puts it in, in a
+        simulation and along a record, before `torque` is asked for. Return `dataclasses.replace(self, memory=...)`.
+        """
         return self
+
+    def along(self, motion: Motion) -> Float[Array, " samples"]:
+        """Its state at each sample of a record, by `step` from the one before; `begin` where a recording begins.
+
+        So `torque` of an effect with a state may use `self.memory`: it is put in before `torque` is asked for.
+        """
+        own = cast(Any, self)
+
+        def follow(z: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+            velocity, begins = now
+            z = jnp.where(begins, self.begin(velocity), changed(own, memory=z).step(velocity, motion.dt).memory)
+            return z, z
+
+        return jax.lax.scan(follow, jnp.zeros(()), (jnp.asarray(motion.velocity, float), motion.begins))[1]
+
+    def remembering(self, motion: Motion) -> Effect:
+        """The effect with its state along a record, where it has one that is not known."""
+        if not self.has("step") or getattr(self, "memory", None) is not None:
+            return self
+        return changed(self, memory=self.along(motion))
 
     def begin(self, velocity: Float[Array, " nv"]) -> Float[Array, ""]:
         """The state where a simulation begins at a velocity: the sign of its joint's, sliding; yours may be another."""
@@ -443,7 +467,7 @@ class Effect(eqx.Module):
 
     def joint_torque(self, motion: Motion) -> Float[Array, "samples nv"]:
         """`torque` in the columns of all joints, zero elsewhere."""
-        torque = self.torque(motion)
+        torque = self.remembering(motion).torque(motion)
         return self.in_joints(torque, motion) if self.has("torque") else torque  # a change is felt at every joint
 
     def in_joints(self, torque: Float[Array, "samples *rows"], motion: Motion) -> Float[Array, "samples nv"]:
@@ -535,8 +559,20 @@ def place(effect: type[Effect], model: Any, at: Sequence[str] | str = (), **para
         known = ", ".join(numbers or fields)
         raise InputError(f"effect '{effect.name}' has no parameter '{sorted(unknown)[0]}'; known: {known}")
     indices = np.asarray([index(name) for name in at], dtype=np.int64)
+    if effect.has("step"):
+        _check_memory(effect)
     given = {name: _number(effect, name, x) if name in numbers else x for name, x in parameters.items()}
     return effect(indices, **given)
+
+
+def _check_memory(effect: type[Effect]) -> None:
+    """Refuse a state that would stand still along a record."""
+    memory = next((f for f in dataclasses.fields(effect) if f.name == "memory"), None)
+    if memory is None or memory.default is not None:
+        raise InputError(
+            f"effect '{effect.name}' has a `step`, so its state is a field `memory: Any = eqx.field(default=None,"
+            " kw_only=True)`, which the library puts in"
+        )
 
 
 def _number(effect: type[Effect], name: str, value: Any) -> Any:
@@ -578,7 +614,7 @@ def joint_unit(unit: str, prismatic: bool) -> str:
 
 def columns(effect: Effect, motion: Motion) -> Float[Array, "amplitudes samples *rows"]:
     """Torque (read or added) of a unit of each amplitude: the exact columns of the regressor, for the given shape."""
-    names = effect.amplitudes()
+    names, effect = effect.amplitudes(), effect.remembering(motion)
 
     def torque(values: Float[Array, " amplitudes"]) -> Float[Array, "samples *rows"]:
         one = eqx.tree_at(lambda e: [getattr(e, n) for n in names], effect, list(values))

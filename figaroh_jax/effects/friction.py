@@ -236,17 +236,16 @@ class Bristle(JointEffect):
 
     def torque(self, motion: Motion) -> Float[Array, " samples"]:
         """force (z - s(v)), N m or N: the bristle's friction beyond the Coulomb friction that it comes with."""
-        return self.force * (self.bent(motion) - self.here(motion.direction))
+        bent = self.along(motion) if self.memory is None else self.memory
+        return self.force * (bent - self.here(motion.direction))
 
     def level(self, velocity: Float[Array, "*samples"]) -> Float[Array, "*samples"]:
         """Deflection at which the bristle slides at a speed."""
         return jnp.ones_like(velocity)
 
-    def bent(self, motion: Motion) -> Float[Array, " samples"]:
+    def along(self, motion: Motion) -> Float[Array, " samples"]:
         """The state z along a record; sliding where the instants are none."""
         v = self.here(motion.velocity)
-        if self.memory is not None:
-            return self.memory * jnp.ones_like(v)
         end, stays = self._turn(v, motion.dt)
         stays = jnp.where(motion.begins, 0.0, stays)
 

@@ -89,7 +89,7 @@ def _best(
         effect = _effect(here.loop, c, x)
         for name in names:
             numbers = {one: np.float64(one == name) for one in names}
-            torques.append(np.asarray(changed(effect, **numbers).torque(motion)).reshape(-1))
+            torques.append(np.asarray(changed(effect, **numbers).remembering(motion).torque(motion)).reshape(-1))
     columns = np.stack(torques, -1).reshape(*left.shape, -1)
     period = here.runs[0].time[1] - here.runs[0].time[0]
     moved = _moved(servo, columns, float(period)) * weight[..., None]
