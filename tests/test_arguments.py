@@ -18,6 +18,7 @@ VISCOUS: Any = fj.CATALOGUE["viscous_friction"]
 MODEL = fj.extend(ROBOT, fj.place(VISCOUS, ROBOT, ["elbow"]))
 DATA: Any = fj.torque_data(ROBOT, RUN, fj.Preprocess(cutoff=10))
 FEW: Any = eqx.tree_at(lambda d: d.position, DATA, np.asarray(DATA.position)[:, :-5])
+LEARNED = fj.learn(ROBOT)
 TIME = np.arange(300) / 100.0
 
 
@@ -46,6 +47,9 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "other motion": (lambda: fj.residual(MODEL, FEW), r"data.position has shape .* but data.time \(1, "),
     "dt": (lambda: fj.predict(MODEL, TIME, Q, Q, Q, 0.0), "dt is 0.0; .*above zero, in s"),
     "step": (lambda: fj.simulate(MODEL, Q, Q[0], Q[0], -0.01), "dt is -0.01"),
+    "basis": (lambda: ANY.excite(ROBOT, "fourier"), "basis is of type str; `fourier`, `spline`"),
+    "weights": (lambda: fj.Trajectory(Q[0], np.ones((3, 3)), fj.spline(4, 2.0)).states(), r"\(4, 4\) is expected"),
+    "motion": (lambda: ANY.information(ROBOT, Q, LEARNED), "three arrays"),
     "loop": (lambda: ANY.rollout(ROBOT, Q, Q[0]), "loop is of type RobotModel; `load_loop`"),
 }
 

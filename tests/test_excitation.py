@@ -20,6 +20,7 @@ from figaroh_jax.excitation.motions import Basis, Trajectory, fourier, quintic, 
 from figaroh_jax.excitation.objectives import (
     condition_objective,
     information_objective,
+    own_objective,
     prediction_objective,
     smooth_condition_objective,
 )
@@ -239,6 +240,17 @@ def test_gradients_by_the_gram_matrix_are_those_of_finite_differences():
         h = 1e-6
         change = (objective(G + h * step)[0] - objective(G - h * step)[0]) / (2 * h)
         assert np.sum(objective(G)[1] * step) == pytest.approx(change, rel=1e-5)
+
+
+def test_an_objective_of_jax_needs_no_slope():
+    G, step = (x @ x.T for x in np.random.default_rng(3).normal(size=(2, 5, 9)))
+    with jax.enable_x64(True):
+        value, slope = own_objective(lambda G: -jax.numpy.linalg.slogdet(G)[1] / 5)(G)
+    expected = information_objective(np.zeros((5, 5)))(G)
+    assert value == pytest.approx(expected[0]) and np.allclose(slope, expected[1])
+    assert own_objective(information_objective(step))(G)[0] == information_objective(step)(G)[0]
+    with pytest.raises(InputError, match=r"objective gives an array of shape \(5, 5\)"):
+        own_objective(lambda G: G)(G)
 
 
 def test_a_designed_motion_tells_more_than_random_ones_and_meets_its_limits_by_pinocchio(arm: RobotModel):

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ..effects.base import Effect
 from ..effects.extended import ExtendedModel
@@ -17,7 +17,13 @@ from ..rigid.model import RobotModel
 from .information import Learned, learn
 from .limits import Limits, Torque, limits_of, unmeetable
 from .motions import Basis, Trajectory
-from .objectives import condition_objective, information_objective, prediction_objective, smooth_condition_objective
+from .objectives import (
+    condition_objective,
+    information_objective,
+    own_objective,
+    prediction_objective,
+    smooth_condition_objective,
+)
 from .sampling import Sampler
 from .search import Stage, best_motion, random_motion
 from .separation import Causes, Separated, causes, check_told, separated, separation_objective
@@ -80,7 +86,7 @@ def excite(
     limits: Limits | None = None,
     learned: Learned | None = None,
     *,
-    objective: Objective | GramObjective = "information",
+    objective: Objective | GramObjective | Callable[[Array], Array] = "information",
     predict: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]] = (),
     separate: Sequence[tuple[Cause, Cause]] = (),
     trust: float = 0.10,
@@ -96,7 +102,8 @@ def excite(
     `limits` and `learned` None: as `limits_of` and `learn` have them of the model. `objective` "information" makes the
     log determinant large, "prediction" the error on the motions `predict` (arrays q, v, a) small, "condition" the
     condition number of the weighted rows, "separate" the pairs of causes `separate` easy to tell apart (`trust` is then
-    the relative sigma of a link that is a cause); or a function of the Gram matrix (`solvers.GramObjective`).
+    the relative sigma of a link that is a cause); or a function of the Gram matrix (n, n) of the weighted rows, that is
+    made small: one of JAX that gives a number, or one that gives the number and its slope (`solvers.GramObjective`).
     `start` is the posture at the beginning (rad or m; None: chosen), `starts` how many random motions are improved,
     `rate` (Hz) the samples of a design, whose noise is independent. Raises `InputError` where no motion meets the
     limits, the start is outside of them, or `predict` is needed and empty.
@@ -109,6 +116,8 @@ def excite(
     True
     >>> q, v, a = found.stages[0].motion.states(rate=1000.0)  # what the robot is to run
     """
+    if not isinstance(basis, Basis):
+        raise InputError(f"basis is of type {type(basis).__name__}; `fourier`, `spline` and `quintic` make one")
     asked = _asked(model, limits, learned, start)
     with jax.enable_x64(True):
         aim = _aim(asked, basis, objective, predict, separate, trust, rate)
@@ -165,7 +174,7 @@ def _asked(
 class _Aim:
     """What a design makes large, and the rows that it takes."""
 
-    objective: Objective | GramObjective
+    objective: Objective | GramObjective | Callable[[Array], Array]
     wanted: np.ndarray | None  # mean Gram matrix of the motions that are to be predicted
     given: Causes | None  # that are to be told apart
     rows: tuple[Sampler, np.ndarray | None, tuple[float, ...]]  # sampler, its columns that count, late torques
@@ -183,7 +192,7 @@ class _Aim:
 def _aim(
     asked: _Asked,
     basis: Basis,
-    objective: Objective | GramObjective,
+    objective: Objective | GramObjective | Callable[[Array], Array],
     predict: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
     separate: Sequence[tuple[Cause, Cause]],
     trust: float,
@@ -333,7 +342,7 @@ def _wanted(
 
 
 def _objectives(
-    objective: Objective | GramObjective,
+    objective: Objective | GramObjective | Callable[[Array], Array],
     prior: np.ndarray,
     wanted: np.ndarray | None,
     given: Causes | None,
@@ -341,7 +350,7 @@ def _objectives(
 ) -> tuple[tuple[GramObjective, ...], ...]:
     """Ways to a motion, which starts take in turn: objectives one after another, the last is the one that counts."""
     if callable(objective):
-        return ((objective,),)
+        return ((own_objective(objective),),)
     if objective == "information":
         return ((information_objective(prior),),)
     if objective == "prediction":

@@ -177,7 +177,11 @@ def _drives(terms: Sequence[Effect], effects: Sequence[Effect]) -> Float[np.ndar
 
 
 def _states(motion: Trajectory | States, rate: float) -> States:
-    return motion.states(rate) if isinstance(motion, Trajectory) else motion
+    if isinstance(motion, Trajectory):
+        return motion.states(rate)
+    if not isinstance(motion, (tuple, list)) or len(motion) != 3:
+        raise InputError(f"motion is of type {type(motion).__name__}; a Trajectory or three arrays q, v, a are needed")
+    return motion
 
 
 @in_float64

@@ -153,7 +153,12 @@ class Trajectory(eqx.Module):
         self, time: Float[ArrayLike, " samples"]
     ) -> tuple[Float[Array, "*batch samples nv"], Float[Array, "*batch samples nv"], Float[Array, "*batch samples nv"]]:
         """As `states`, at the given times (s)."""
-        matrix = self.basis.at(np.asarray(time))
+        matrix, joints = self.basis.at(np.asarray(time)), np.shape(self.start)[-1:]
+        if np.shape(self.weights)[-2:] != (*joints, self.basis.size):
+            raise InputError(
+                f"weights have shape {np.shape(self.weights)}; {(*joints, self.basis.size)} is expected: a row for each"
+                f" number of start {np.shape(self.start)}, a column for each of the basis' functions"
+            )
         space = jnp if any(isinstance(x, jax.Array) for x in (self.start, self.weights)) else np
         q, v, a = (space.swapaxes(space.asarray(self.weights) @ phi.T, -1, -2) for phi in matrix)
         return q + space.asarray(self.start)[..., None, :], v, a

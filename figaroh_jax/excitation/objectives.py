@@ -9,13 +9,25 @@ r"""What a design makes as small as it can, as a function of the Gram matrix G o
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..errors import InputError
 from .programming import lapack
 from .solvers import GramObjective
 
-__all__ = ["condition_objective", "information_objective", "prediction_objective", "smooth_condition_objective"]
+__all__ = [
+    "condition_objective",
+    "information_objective",
+    "own_objective",
+    "prediction_objective",
+    "smooth_condition_objective",
+]
 
 _RIDGE = 1e-12  # of the mean diagonal: a motion that shows less has no finite information
 SHARPNESS = 4.0  # of the soft extremes of the eigenvalues
@@ -84,3 +96,19 @@ def smooth_condition_objective(sharpness: float = SHARPNESS) -> GramObjective:
         return 0.5 * float(value), 0.5 * (vectors * slope) @ vectors.T
 
     return objective
+
+
+def own_objective(objective: Callable[..., Any]) -> GramObjective:
+    """A user's objective with its slope, which is JAX's where the function gives none."""
+    both = jax.jit(jax.value_and_grad(objective))
+
+    def told(G: Float[np.ndarray, "n n"]) -> tuple[float, Float[np.ndarray, "n n"]]:
+        given = objective(G)
+        if isinstance(given, tuple):
+            return given
+        if np.shape(given) != ():
+            raise InputError(f"objective gives an array of shape {np.shape(given)}; a number is expected")
+        value, slope = both(jnp.asarray(G))
+        return float(value), np.asarray(slope + slope.T) / 2
+
+    return told
