@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from math import prod
 from typing import Any
 
@@ -130,7 +131,8 @@ def fit(
 
 @in_float64
 def _solved(problem: _Problem, solver: Any, max_steps: int) -> Fit:
-    return (_solve_quick if _brief(problem) else _solve)(problem, solver, max_steps)
+    solve = _solve_quick if _brief(problem) else _solve
+    return replace(solve(replace(problem, free=problem.free.unnamed()), solver, max_steps), free=problem.free)
 
 
 def _brief(problem: _Problem) -> bool:

@@ -94,6 +94,12 @@ class Free(NamedTuple):
         """Typical size of each number."""
         return np.array([size for part in self.parts for size in part.sizes], float)
 
+    def unnamed(self) -> Free:
+        """The same without names, so that one program serves the same numbers at any place."""
+        return Free(
+            tuple(p._replace(names=("",) * len(p.names), units=("",) * len(p.units), words=()) for p in self.parts)
+        )
+
     def held(self, model: ExtendedModel, values: Float[np.ndarray, " numbers"]) -> Float[np.ndarray, " numbers"]:
         """Each number as the model holds it; where it holds no such number (frames, offsets, drives) its change."""
         out, first = np.array(values, float), 0
