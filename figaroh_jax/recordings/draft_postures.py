@@ -186,9 +186,9 @@ def _positions(
     named = [n for n in table.names if any(holds(n, joint, model.joint_names) for joint in model.joint_names)]
     named = [n for n in named if n in kinds.get("position", ())] or named
     rest = [n for n in table.names if n not in measured]
-    found = [n for n in kinds.get("position", ()) if n not in measured and n not in _turned(table.names)[0]]
+    found = [n for n in kinds.get("position", ()) if n not in measured and n not in _turned(table, model)[0]]
     if not found:
-        rest = [n for n in rest if n not in _turned(table.names)[0]]
+        rest = [n for n in rest if n not in _turned(table, model)[0]]
         count = len(joints or model.joint_names)
         found = rest if len(rest) == count > 1 else _numbered(rest, count)
     found = named or found
@@ -225,8 +225,10 @@ def _chains(model: RobotModel, count: int) -> list[tuple[str, ...]]:
     return list(dict.fromkeys(tuple(names) for names in above if len(names) == count))
 
 
-def _turned(names: Sequence[str]) -> tuple[list[str], list[str]]:
+def _turned(table: Table, model: RobotModel) -> tuple[list[str], list[str]]:
     """Columns of orientations in their order, and what they may be as `measurement.orientation` says it."""
+    joints = model.joint_names
+    names = [n for n in table.names if not any(holds(n, joint, joints) for joint in joints)]
     for pattern, ways in (
         (r"(?:.*[_. ])?q?_?({})", ("xyzw", ["xyzw"])),
         (r"(?:.*[_. ])?(?:r|rv|rot|ori|phi)_?({})\d*(?:[ _]?[\[(]?(?:deg|rad)[\])]?)?", ("xyz", ["rpy", "rotvec"])),
@@ -268,7 +270,7 @@ def _measurements(table: Table, model: RobotModel, postures: int) -> Iterator[di
             or (values.ndim == 2 and width[0] % 3 == 0 and "pose" not in name.lower())
         ):
             yield {"position": name}
-    turned, ways = _turned(table.names)
+    turned, ways = _turned(table, model)
     columns = [n for n in measured if n not in turned and np.ndim(table.read(n)) == 1]
     columns = _by_point(columns)
     if turned and len(columns) == 3:
@@ -409,7 +411,7 @@ def _unclear(table: Table, model: RobotModel, position: Any, why: str) -> InputE
     """The refusal of postures, with the task that a user can complete."""
     from ..formats.export import dump_yaml
 
-    measured, (turned, ways) = _measured(table, model), _turned(table.names)
+    measured, (turned, ways) = _measured(table, model), _turned(table, model)
     columns = [position] if isinstance(position, str) else [*position]
     named = [j for n in columns for j in model.joint_names if holds(n, j, model.joint_names)]
     robot = {"model": "MODEL"} | ({"joints": named} if named and named != [*model.joint_names] else {})

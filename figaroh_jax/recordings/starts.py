@@ -80,6 +80,8 @@ def place_poses(
     base, tool = np.eye(4), np.eye(4)
     if {"base_frame", "tool_frame"} <= set(estimated):
         base[:3, :3], tool[:3, :3] = _both_rotations(R, R_m)
+        turn = _about_the_axis(base[:3, :3], R, p, x)
+        base[:3, :3], tool[:3, :3] = base[:3, :3] @ turn, turn.T @ tool[:3, :3]
     elif "base_frame" in estimated:
         base[:3, :3] = _nearest_rotation(np.einsum("nij,nkj->ik", R_m, R))
     elif "tool_frame" in estimated:
@@ -98,7 +100,54 @@ def place_poses(
 
 
 def _both_rotations(R: Array, R_m: Array) -> tuple[Array, Array]:
-    """B and X with M_i = B R_i X for all i."""
+    """B and X with M_i = B R_i X for all i, the better of two ways.
+
+    Where all postures turn about one axis many B and X do, and the null vector of the first way mixes them into no
+    rotation; the second takes one of them.
+    """
+    ways = _by_null_vector(R, R_m), _by_turns(R, R_m)
+    return min(ways, key=lambda pair: float(np.sum((R_m @ pair[1].T - pair[0] @ R) ** 2)))
+
+
+def _by_turns(R: Array, R_m: Array) -> tuple[Array, Array]:
+    """B and X from the turns between postures, whose vectors X' takes from the robot's to the device's (Park 1994)."""
+    from scipy.spatial.transform import Rotation
+
+    i, j = np.triu_indices(len(R), 1)
+    some = slice(None, None, max(len(i) // _PAIRS, 1))
+    i, j = i[some], j[some]
+    a, b = (Rotation.from_matrix(np.swapaxes(x[i], 1, 2) @ x[j]).as_rotvec() for x in (R, R_m))
+    told = (np.linalg.norm(a, axis=1) < _HALF_TURN) & (np.linalg.norm(b, axis=1) < _HALF_TURN)
+    X = _nearest_rotation(b[told].T @ a[told]).T
+    return _nearest_rotation(np.einsum("nij,kj,nlk->il", R_m, X, R)), X
+
+
+def _about_the_axis(B: Array, R: Array, p: Array, x: Array) -> Float[Array, "3 3"]:
+    """What the positions add to B where all postures turn about one axis: then orientations leave a turn about it open.
+
+    With the axis a, x_i = b + B (c p_across + s a x p + p_along) + B R_i m is linear in c, s, b and m.
+    """
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_matrix(np.swapaxes(R[:1], 1, 2) @ R[1:]).as_rotvec()
+    _, size, axes = np.linalg.svd(turns, full_matrices=False)
+    if len(turns) < 3 or size[1] > _ONE_AXIS * size[0]:
+        return np.eye(3)
+    axis = R[0] @ axes[0]
+    along = np.outer(p @ axis, axis)
+    columns = [(p - along) @ B.T, np.cross(axis, p) @ B.T]
+    pose = np.concatenate([np.broadcast_to(np.eye(3), R.shape), B @ R], axis=2).reshape(3 * len(x), 6)
+    linear = np.hstack([np.stack([one.reshape(-1) for one in columns], axis=1), pose])
+    cosine, sine = np.linalg.lstsq(linear, (x - along @ B.T).reshape(-1), rcond=1e-10)[0][:2]
+    return Rotation.from_rotvec(np.arctan2(sine, cosine) * axis).as_matrix()
+
+
+_ONE_AXIS = 0.02  # second to first singular value of the turns: what noise makes of one axis
+_PAIRS, _HALF_TURN = 2000, 3.0  # rad: beyond it noise turns a vector round
+
+
+def _by_null_vector(R: Array, R_m: Array) -> tuple[Array, Array]:
+    """B and X as the null vector of M X' = B R (Shah 2013)."""
     eye = np.eye(3)
     # M X' - B R = 0, the entries of X' and of B row by row
     of_tool = np.einsum("nij,kl->nikjl", R_m, eye).reshape(-1, 9)
