@@ -156,6 +156,19 @@ def test_what_the_controller_computed_is_not_taken_for_the_measurement(measured,
     np.testing.assert_allclose(one.values, poses, rtol=0, atol=1e-9)
 
 
+def test_a_second_measurement_and_what_was_not_seen_are_told(measured, tmp_path: Path):
+    """A worse device beside, a marker that hides in some postures, and a row in which nothing was seen."""
+    urdf, q, poses, points = measured
+    hidden = points.copy()
+    hidden[::7, 1], hidden[4] = np.nan, np.nan
+    camera = poses[:, :3, 3] + np.random.default_rng(2).normal(0, 3e-3, (30, 3))
+    np.savez(tmp_path / "run.npz", q=q, markers=hidden, camera_xyz=camera)
+    draft = draft_task(urdf, [tmp_path / "run.npz"])
+    assert "camera_xyz agrees with the robot less well than markers, and is not used" in draft.text
+    (one,) = _read(urdf, [tmp_path / "run.npz"], tmp_path)
+    np.testing.assert_allclose(one.values, hidden, rtol=0, atol=1e-12)
+
+
 def test_sets_of_one_file_are_recordings_and_those_that_test_are_held_out(measured, tmp_path: Path):
     """A test set of the same device is held out; one of another device cannot be predicted, and is fitted."""
     urdf, q, _, points = measured
@@ -170,7 +183,7 @@ def test_joints_in_another_order_agree_with_the_robot_in_no_meaning(measured, tm
     urdf, q, poses, _ = measured
     turned = [3, 0, 1, 2, 5, 4]
     np.savez(tmp_path / "run.npz", q=q[:, turned], pose=poses)
-    with pytest.raises(InputError, match=r"the order of the joints right \(--joints\)"):
+    with pytest.raises(InputError, match="--joints names the joints of the columns"):
         draft_task(urdf, [tmp_path / "run.npz"])
     (one,) = _read(urdf, [tmp_path / "run.npz"], tmp_path, joints=[ARM[k] for k in turned])
     np.testing.assert_allclose(one.position[:, [turned.index(k) for k in range(6)]], q, rtol=0, atol=1e-12)

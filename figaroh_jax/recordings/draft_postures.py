@@ -50,6 +50,7 @@ class _Meaning(NamedTuple):
     metres: float = np.inf  # the same, m
     computed: bool = False  # whether the measurement is what the robot's file says itself
     postures: int = 0
+    beside: tuple[str, ...] = ()  # what else looks measured, and agrees as a measurement does
     shape: tuple[int, ...] = ()  # of one measurement: the same device has the same
 
 
@@ -155,6 +156,8 @@ def _said(table: Table, model: RobotModel, best: _Meaning) -> Iterator[str]:
             f"the robot as it is misses {_name(seen[kind])} by {1e3 * best.metres:.3g} mm (median), once the device and"
             f" the marker on {seen['tool_frame']} are placed"
         )
+    if best.beside:
+        yield f"{', '.join(best.beside)} agrees with the robot less well than {_name(seen[kind])}, and is not used"
 
 
 def _name(source: str | Sequence[str]) -> str:
@@ -264,15 +267,11 @@ def _measurements(table: Table, model: RobotModel, postures: int) -> Iterator[di
             ways = {(7,): [None, "wxyz"], (6,): ["rpy", "rotvec"]}.get(width, [None])
             for way, kind in product(ways, ({"pose": name}, {"camera": name, "mount": "hand"})):
                 yield kind | ({} if way is None else {"orientation": way})
-        if (
-            width[-1] == 3
-            and values.ndim <= 3
-            or (values.ndim == 2 and width[0] % 3 == 0 and "pose" not in name.lower())
-        ):
+        listed = values.ndim == 2 and width[0] % 3 == 0 and "pose" not in name.lower()
+        if listed or width[-1] == 3:
             yield {"position": name}
     turned, ways = _turned(table, model)
-    columns = [n for n in measured if n not in turned and np.ndim(table.read(n)) == 1]
-    columns = _by_point(columns)
+    columns = _by_point([n for n in measured if n not in turned and np.ndim(table.read(n)) == 1])
     if turned and len(columns) == 3:
         for way, kind in product(ways, ("pose", "camera")):
             mount = {"mount": "hand"} if kind == "camera" else {}
@@ -336,8 +335,11 @@ def _best(
                 frames |= {"unknown": ["base_frame", "tool_frame"]}
                 found.append((arm, _judged(arm, entry | {"measurement": {**seen, **frames}})))
     found.sort(key=lambda one: (one[1].computed, one[1].misses))
-    _refuse_unsure(table, whole, [meaning for _, meaning in found], position)
-    return found[0]
+    meanings = [meaning for _, meaning in found]
+    _refuse_unsure(table, whole, meanings, position)
+    taken = _source(meanings[0])
+    beside = dict.fromkeys(_source(one) for one in meanings if one.misses <= FITS and not one.computed)
+    return found[0][0], meanings[0]._replace(beside=tuple(name for name in beside if name != taken))
 
 
 def _refuse_unsure(table: Table, model: RobotModel, found: list[_Meaning], position: Any) -> None:
@@ -353,8 +355,8 @@ def _refuse_unsure(table: Table, model: RobotModel, found: list[_Meaning], posit
             model,
             position,
             "in no unit and on no body do they agree with the robot: at best it misses them by"
-            f" {1e3 * best.metres:.3g} mm, {100 * best.misses:.0f} % of their spread. Is the order of the joints right"
-            " (--joints)?",
+            f" {1e3 * best.metres:.3g} mm, {100 * best.misses:.0f} % of their spread; --joints names the joints of the"
+            " columns in their order",
         )
     alike = [one for one in found[1:] if one.misses < APART * best.misses and not one.computed]
     if any(_source(one) == _source(best) for one in alike):
@@ -379,7 +381,7 @@ def _judged(arm: _Arm, entry: dict[str, Any]) -> _Meaning:
     measurement = entry["measurement"] | {"tool_frame": arm.frames[body]}
     misses, metres, computed = judged[body]
     shape = recording.values.shape
-    return _Meaning(entry | {"measurement": measurement}, misses, metres, computed, shape[0], shape[1:])
+    return _Meaning(entry | {"measurement": measurement}, misses, metres, computed, shape[0], shape=shape[1:])
 
 
 def _misses(recording: PoseRecording, body: Float[np.ndarray, "n 4 4"]) -> tuple[float, float, bool]:
@@ -388,6 +390,9 @@ def _misses(recording: PoseRecording, body: Float[np.ndarray, "n 4 4"]) -> tuple
     The third says whether neither has to be placed. An orientation counts as the spread's length times its angle.
     """
     both, R, p = ("base_frame", "tool_frame"), body[:, :3, :3], body[:, :3, 3]
+    whole = np.isfinite(recording.values.reshape(len(p), -1))
+    if not whole.any(axis=1).any() or (recording.kind == "pose" and not whole.all(axis=1).any()):
+        return np.inf, np.inf, False
     if recording.kind == "pose":
         base, tool = place_poses(R, p, recording.values, both)
         told = base @ body @ tool
@@ -399,7 +404,7 @@ def _misses(recording: PoseRecording, body: Float[np.ndarray, "n 4 4"]) -> tuple
         points, (base, markers) = recording.values, place_points(R, p, recording.values, both)
         told = np.einsum("nij,kj->nki", R, markers) + p[:, None]
         told = told @ base[:3, :3].T + base[:3, 3]
-        off, angle = np.nanmean(np.linalg.norm(told - points, axis=2), axis=1), np.zeros(len(p))
+        off, angle = np.linalg.norm(told - points, axis=2), np.zeros(1)
     spread = float(np.sqrt(np.nansum(np.nanvar(points.reshape(len(points), -1, 3), axis=0).mean(axis=0))))
     off, angle = float(np.nanmedian(off)), float(np.nanmedian(angle))
     computed = off < OWN and angle < OWN and bool(np.abs(base - np.eye(4)).max() < OWN_BASE)
