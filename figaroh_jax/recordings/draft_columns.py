@@ -228,6 +228,7 @@ def _unit_of_current(source: Any) -> str:
 
 
 def words_of(name: str) -> list[str]:
+    """The words of a column's name in small letters: `jointPos_1 [deg]` holds joint, pos and deg."""
     return [word for word in re.split(r"[^a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()) if word]
 
 
