@@ -29,10 +29,16 @@ from figaroh_jax.reporting.wording import sentence
         (21003, False),  # a ripple: 4 s of slow noise
         (21057, False),  # unknown: friction turns between samples 20 ms apart
         (1007, True),  # unknown: 60 Hz with stamps in whole milliseconds
-        (4128483, False),  # unknown: what slow noise carries through rows left out passed for noise at 10 to 20 Hz
-        (971270108, False),  # unknown: slow noise, most of whose power is a hundredth of the band
+        pytest.param(
+            4128483, False, marks=pytest.mark.slow
+        ),  # unknown: what slow noise carries through rows left out passed for noise at 10 to 20 Hz
+        pytest.param(
+            971270108, False, marks=pytest.mark.slow
+        ),  # unknown: slow noise, most of whose power is a hundredth of the band
         (4128371, False),  # unknown: two repeats of 4 s, whose common power was told twice
-        (4129578, True),  # unknown: repeats with a torque of ten bits, whose steps repeat
+        pytest.param(
+            4129578, True, marks=pytest.mark.slow
+        ),  # unknown: repeats with a torque of ten bits, whose steps repeat
         (971272111, True),  # unknown: a known payload was taken for a wrong clock
     ],
 )

@@ -33,10 +33,8 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 
 SEED = int.from_bytes(os.urandom(3), "little")  # told where a test fails
 TWIN = 20  # one whose friction is named on both robots
-ROBOTS = [
-    "small",
-    pytest.param("panda", marks=pytest.mark.skipif(not available("panda"), reason="FIGAROH_JAX_DATA has no Panda")),
-]
+NEEDS_PANDA = pytest.mark.skipif(not available("panda"), reason="FIGAROH_JAX_DATA has no Panda")
+ROBOTS = ["small", pytest.param("panda", marks=NEEDS_PANDA)]
 Arrays = dict[str, np.ndarray]
 WRONG: dict[str, tuple[Callable[[Arrays], Arrays], list[float] | None, str]] = {
     "torque at a seventh": (lambda z: z | {"tau": z["tau"] / 7}, None, "torque"),
@@ -79,7 +77,10 @@ def nothing_is_named(found: Diagnosis, words: str) -> None:
     assert all(near["why_not"] for near in told["rest"]["nearest"])
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize(
+    "robot",
+    ["small", pytest.param("panda", marks=[NEEDS_PANDA, pytest.mark.slow])],  # a minute each
+)
 @pytest.mark.parametrize("wrong", WRONG)
 def test_a_recording_that_contradicts_its_model_gets_no_name(wrong: str, robot: str, tmp_path: Path):
     spoil, gravity, words = WRONG[wrong]

@@ -142,7 +142,7 @@ def test_an_effect_beside_a_geometry_that_is_right_is_named(folder: Path):
 def test_a_robot_that_is_right_and_stands_where_it_is_said_to_has_nothing_to_fit(folder: Path):
     """Known frames, exact links: not one unknown is left, and that is no error."""
     arm = study().arm("arm6", folder)
-    rng = np.random.default_rng()
+    rng = np.random.default_rng(5)  # noise that passes for offsets, as one draw in thirty does, has them fitted
     q = poses.postures(rng, 40)
     seen = postures.as_seen([pose for pose in _exact(arm, q)], rng)
     case = postures.Hidden("nothing", frozenset(), (), (postures.Recording(np.arange(40.0), q, seen, False),))

@@ -146,7 +146,7 @@ REAL = {  # what is known of the sets from elsewhere: see the README of each and
 }
 
 
-@pytest.mark.parametrize("name", REAL)
+@pytest.mark.parametrize("name", ["panda", "tx40", pytest.param("dfki_double_pendulum", marks=pytest.mark.slow)])
 def test_what_is_wrong_with_the_links_of_real_robots_files_is_told(name: str, data_dir: Path, tmp_path: Path) -> None:
     """The Panda's file has a hand that was not mounted, the pendulum's its inertias about the joints, as the set's own
     yml has them; the TX40's has no rotors."""
@@ -209,6 +209,7 @@ def test_what_a_file_fixes_to_a_link_is_what_the_link_has_more_with_it(form: str
     assert (whole.inertia[0], finger.inertia[0]) == pytest.approx((0.8, 0.1))
 
 
+@pytest.mark.slow
 def test_the_real_pandas_file_without_its_hand_fits_as_the_answer_says(data_dir: Path, tmp_path: Path) -> None:
     """What is told of the file, done to it: its links then leave a fifth of the error, none being fitted."""
     from benchmarks import blackbox

@@ -33,7 +33,12 @@ def loud(case: Case) -> np.ndarray:
 
 @needs_robots
 @pytest.mark.parametrize(
-    "seed", [secrets.randbits(31), 1325230507, 539310508], ids=["drawn", "slow end of a motion", "creeps"]
+    "seed",
+    [
+        pytest.param(secrets.randbits(31), id="drawn"),
+        pytest.param(1325230507, id="slow end of a motion", marks=pytest.mark.slow),
+        pytest.param(539310508, id="creeps", marks=pytest.mark.slow),
+    ],
 )
 def test_the_noise_beside_a_large_ripple_is_that_of_its_sensor(seed: int):
     """It had been told up to eight times too large, and the intervals with it; below 2.2 times it stays.
@@ -70,11 +75,10 @@ def test_what_the_catalogue_lacks_is_not_told_as_noise(effect: str, at: tuple[st
     "effect, seed, scale, colour, step",
     [
         # nearly dependent columns of the rich model cancelled in the rows they were fitted to, and in no others
-        ("clock_error", 3306761008, 2.0, "ar100", 1e-5),
+        pytest.param("clock_error", 3306761008, 2.0, "ar100", 1e-5, id="clock"),
         # a step beyond all torques leaves no slope to come back by; a power law of the speed was named
-        ("torque_saturation", 1786552537, 0.5, "white", 1e-5),
+        pytest.param("torque_saturation", 1786552537, 0.5, "white", 1e-5, id="limit", marks=pytest.mark.slow),
     ],
-    ids=["clock", "limit"],
 )
 def test_what_a_fit_had_lost_is_named_and_sized(effect: str, seed: int, scale: float, colour: str, step: float):
     hidden = make_case([(effect, 0.15)], "tx40", 1, 4, scale, seed, colour=colour, encoder_step=step)
@@ -86,7 +90,11 @@ def test_what_a_fit_had_lost_is_named_and_sized(effect: str, seed: int, scale: f
 
 
 @pytest.mark.parametrize(
-    ("robot", "seed", "scale", "colour"), [("ur10e", 1654321527, 1.0, "white"), ("panda", 28229906, 2.0, "ar100")]
+    ("robot", "seed", "scale", "colour"),
+    [
+        ("ur10e", 1654321527, 1.0, "white"),
+        pytest.param("panda", 28229906, 2.0, "ar100", marks=pytest.mark.slow),
+    ],
 )
 def test_a_gear_on_which_the_link_swings_in_the_band_of_its_motion_is_named(
     robot: str, seed: int, scale: float, colour: str
@@ -103,7 +111,7 @@ def test_a_gear_on_which_the_link_swings_in_the_band_of_its_motion_is_named(
     assert abs(size.value - truth.parameters["compliance"]) < 3 * size.std
 
 
-@pytest.mark.parametrize("robot", ["tx40", "panda"])
+@pytest.mark.parametrize("robot", ["tx40", pytest.param("panda", marks=pytest.mark.slow)])
 def test_a_torque_that_follows_other_joints_is_not_told_as_noise(robot: str):
     """36 s without repeats: a product of a position and a velocity of two other joints, which the catalogue lacks, was
     `nothing` in nine of nine cases of 5 and 15 %."""
@@ -125,6 +133,7 @@ def test_a_torque_that_follows_other_joints_is_not_told_as_noise(robot: str):
 
 
 @needs_robots
+@pytest.mark.slow
 def test_friction_that_a_law_turns_down_is_no_friction():
     """A drive at its limit, which the catalogue lacked, was a power law that lost a fifth of joint 6's friction again
     towards its top speed."""
@@ -143,6 +152,7 @@ def test_the_slowest_of_all_ripples_is_no_ripple():
 
 
 @needs_robots
+@pytest.mark.slow
 def test_presliding_is_not_what_samples_make_of_friction():
     """Its wide reversal was read as that of dry friction between two samples: `nothing`, at 11 % of the torque."""
     hidden = make_case([("presliding", 0.15)], "tx40", 1, 4, 0.5, 1232811719, colour="ar20", encoder_step=1e-4)
@@ -152,8 +162,11 @@ def test_presliding_is_not_what_samples_make_of_friction():
 @needs_robots
 @pytest.mark.parametrize(
     "size, seed",
-    [(0.2, secrets.randbits(31)), (0.12, 71), (0.2, 1395646121)],
-    ids=["drawn", "half as large", "a rotor in its place"],
+    [
+        pytest.param(0.2, secrets.randbits(31), id="drawn"),
+        pytest.param(0.12, 71, id="half as large", marks=pytest.mark.slow),
+        pytest.param(0.2, 1395646121, id="a rotor in its place", marks=pytest.mark.slow),
+    ],
 )
 def test_a_ripple_beside_joints_that_stick_is_not_told_as_noise(size: float, seed: int):
     """In closed loop what sticks leaves the most; the ripple had been told as noise, and the rest as sticks alone."""
@@ -162,7 +175,7 @@ def test_a_ripple_beside_joints_that_stick_is_not_told_as_noise(size: float, see
 
 
 @needs_robots
-@pytest.mark.parametrize("seed", [2977292912, 892567041])
+@pytest.mark.parametrize("seed", [2977292912, pytest.param(892567041, marks=pytest.mark.slow)])
 def test_friction_that_slides_is_that_of_the_rows_that_move(seed: int):
     """Beside rows at rest it had been told 2 to 5 % too small, and what moves was no longer explained: `unknown`."""
     assert diagnosed(make_stiction_case([], "tx40", repeats=1, trajectories=4, seed=seed)).verdict == "nothing"
@@ -177,7 +190,7 @@ def test_a_link_of_which_no_number_is_known_is_no_cause():
 
 
 @pytest.mark.skipif(not robots.available("ur10e"), reason="FIGAROH_JAX_DATA has no ur10e")
-@pytest.mark.parametrize("seed", [3002095554, 1639379783])
+@pytest.mark.parametrize("seed", [3002095554, pytest.param(1639379783, marks=pytest.mark.slow)])
 def test_joints_that_break_loose_are_no_effect(seed: int):
     """The others' motion foretold a joint beside those that stick, in which nothing is missing: it had been `unknown`.
 
@@ -187,6 +200,7 @@ def test_joints_that_break_loose_are_no_effect(seed: int):
 
 
 @pytest.mark.skipif(not robots.available("panda"), reason="FIGAROH_JAX_DATA has no panda")
+@pytest.mark.slow
 def test_a_payload_that_two_links_carry_alike_is_named():
     """Four candidates fitted alike, and each was fourth in too many folds: `unknown`, with .99 of the squares gone."""
     case = make_stiction_case([("payload", 0.1)], "panda", repeats=1, trajectories=4, seed=938974309)

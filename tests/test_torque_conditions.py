@@ -33,7 +33,7 @@ from figaroh_jax.recordings.signals import prepare_all
         pytest.param(2, "nothing", id="two joints that move one after another, stamps that shake"),
         pytest.param(21, "nothing", id="joints that rest, one of them gated"),
         pytest.param(38, "nothing", id="a joint about the vertical that rests: its torque is all friction"),
-        pytest.param(94, "nothing", id="moves with rests, without a filter"),
+        pytest.param(94, "nothing", id="moves with rests, without a filter", marks=pytest.mark.slow),
         pytest.param(104, "nothing", id="stamps that shake, a recording kept out"),
         pytest.param(73, "nothing", id="an offset of the baseline, and a difference that takes it off"),
         pytest.param(70, "right", id="a coupling behind columns in another order"),
@@ -51,10 +51,18 @@ def test_a_strangers_recording_gets_its_cause(seed: int, mark: str) -> None:
     ("seed", "effects", "mark"),
     [
         pytest.param(7073, [], "nothing", id="steps of an encoder that a gear's resonance filters out"),
-        pytest.param(31000, [], "nothing", id="a joint's position smoothed alone, for another's is abrupt"),
-        pytest.param(50, [], "unknown", id="the same of five joints beside an error of an encoder"),
+        pytest.param(
+            31000,
+            [],
+            "nothing",
+            id="a joint's position smoothed alone, for another's is abrupt",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            50, [], "unknown", id="the same of five joints beside an error of an encoder", marks=pytest.mark.slow
+        ),
         pytest.param(9046, ["joint_elasticity"], "right", id="a gear that winds up"),
-        pytest.param(9031, ["joint_elasticity"], "right", id="the same beside rests"),
+        pytest.param(9031, ["joint_elasticity"], "right", id="the same beside rests", marks=pytest.mark.slow),
     ],
 )
 def test_steps_of_an_encoder_are_no_elasticity(seed: int, effects: list[str], mark: str) -> None:
