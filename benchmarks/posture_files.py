@@ -270,7 +270,7 @@ def drafted(case: Case, rng: np.random.Generator) -> tuple[str, str]:
             return "refused", f"{line}refused: {str(error).splitlines()[0][-330:]}"
         (Path(name) / "task.yaml").write_text(text)
         task = load_task(Path(name) / "task.yaml")
-        robot = load_robot(task)
+        robot = load_robot(task, kinematic=True)
         (read,) = read_pose_recordings(task, robot)
     right = [joints.index(joint) for joint in robot.joint_names]
     seen = case.seen if posed or case.seen.ndim == 3 else case.seen[:, None]

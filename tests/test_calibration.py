@@ -22,6 +22,7 @@ from figaroh_jax.calibration.kinematic_diagnosis import diagnose_poses
 from figaroh_jax.effects.kinematic import CATALOGUE
 from figaroh_jax.formats.config import load_task
 from figaroh_jax.recordings.posture_checks import OFF, check_pose_recording
+from figaroh_jax.reporting.calibration_files import write_calibration
 from figaroh_jax.reporting.calibration_report import nominal_of
 from figaroh_jax.reporting.picture import segments
 from figaroh_jax.reporting.verification import DEFAULT_LIMITS
@@ -196,6 +197,22 @@ def test_a_robot_that_is_already_good_gets_nothing(tmp_path: Path):
     assert (found.level, found.verdict, found.causes, found.outliers) == ("frames", "nothing", (), ())
     assert found.position is not None
     assert found.position.validated_after == found.position.validated_before
+
+
+def test_moments_that_no_body_can_have_are_told_and_kept(tmp_path: Path):
+    """Postures ask for none: the model is as without them, its URDF keeps them, torques refuse the file."""
+    rng = np.random.default_rng(3)
+    task = recorded(tmp_path, rng, poses.truth(rng))
+    sound = (tmp_path / "robot.urdf").read_text()
+    (tmp_path / "robot.urdf").write_text(sound.replace('ixx="0.06"', 'ixx="-0.06"'))
+    found = calibrate_task(load_task(task), level="frames")
+    (note,) = (note for note in found.notes if "robot.urdf: link 'link_j3'" in note)
+    assert "negative principal moment, -0.06 kg m^2" in note and "tasks of torques refuse the file" in note
+    (tmp_path / "run").mkdir()
+    write_calibration(found, tmp_path / "run", tmp_path / "robot.urdf")
+    assert 'ixx="-0.06"' in (tmp_path / "run" / "model" / "robot.urdf").read_text()
+    with pytest.raises(fj.InputError, match="'link_j3': its inertia has a negative principal moment"):
+        fj.load_urdf(tmp_path / "robot.urdf")
 
 
 def spoil(key: str, value: Any) -> Any:

@@ -169,6 +169,19 @@ def test_a_second_measurement_and_what_was_not_seen_are_told(measured, tmp_path:
     np.testing.assert_allclose(one.values, hidden, rtol=0, atol=1e-12)
 
 
+def test_moments_that_no_body_can_have_are_told(measured, tmp_path: Path):
+    urdf, q, poses, _ = measured
+    moments = '<inertia ixx="-0.1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    body = f'<link name="l3"><inertial><mass value="1"/>{moments}</inertial></link>'
+    (tmp_path / "arm.urdf").write_text(urdf.read_text().replace('<link name="l3"/>', body))
+    np.savez(tmp_path / "run.npz", q=q, pose=poses)
+    (said,) = (line for line in draft_task(tmp_path / "arm.urdf", [tmp_path / "run.npz"]).assumed if "'l3'" in line)
+    assert said.startswith("arm.urdf: link 'l3': its inertia has a negative principal moment, -0.1 kg m^2")
+    np.savez(tmp_path / "run.npz", q=np.tile(q, (9, 1)), tau=np.tile(q, (9, 1)))
+    with pytest.raises(InputError, match="'l3': its inertia has a negative"):
+        draft_task(tmp_path / "arm.urdf", [tmp_path / "run.npz"], joints=ARM, rate=100.0)
+
+
 def test_sets_of_one_file_are_recordings_and_those_that_test_are_held_out(measured, tmp_path: Path):
     """A test set of the same device is held out; one of another device cannot be predicted, and is fitted."""
     urdf, q, _, points = measured

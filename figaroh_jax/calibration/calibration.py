@@ -61,11 +61,11 @@ def calibrate_task(
     >>> round(found.solution.parameters["joint_offset shoulder"].value, 4)
     0.02
     """
-    from ..formats.robotfile import load_robot
+    from ..formats.robotfile import impossible_said, load_robot
 
-    model = load_robot(task)
+    model = load_robot(task, kinematic=True)
     recordings = read_pose_recordings(task, model)
-    notes = check_pose_recordings(task, model, recordings)
+    notes = (*impossible_said(task.robot.model), *check_pose_recordings(task, model, recordings))
     found = _calibrated(model, recordings, task.diagnose.forbid, progress, level, priors)
     return replace(found, posture=dict(task.robot.posture), notes=(*notes, *found.notes))
 

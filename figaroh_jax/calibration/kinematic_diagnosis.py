@@ -54,11 +54,11 @@ class PoseDiagnosis(Selection):
 
 def diagnose_pose_task(task: Task, progress: Callable[[str, float], None] = lambda phase, share: None) -> PoseDiagnosis:
     """Diagnose the robot of a task from its recordings with a `measurement`."""
-    from ..formats.robotfile import load_robot
+    from ..formats.robotfile import impossible_said, load_robot
 
-    model = load_robot(task)
+    model = load_robot(task, kinematic=True)
     recordings = read_pose_recordings(task, model)
-    notes = check_pose_recordings(task, model, recordings)
+    notes = (*impossible_said(task.robot.model), *check_pose_recordings(task, model, recordings))
     stated = task.diagnose.tolerance
     widths = (stated.offset, stated.geometry)
     found = diagnose_poses(model, recordings, task.diagnose.forbid, task.diagnose.alpha, progress, tolerance=widths)

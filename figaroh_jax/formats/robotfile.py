@@ -33,14 +33,14 @@ from .mjcf import (
     mjcf_parts,
 )
 from .native import place_names
-from .urdf import load_urdf, said_twice, urdf_dynamics, urdf_parts
+from .urdf import impossible_moments, load_urdf, said_twice, urdf_dynamics, urdf_parts
 from .usd import load_usd, usd_joints, usd_parts
 from .xmlfile import find_in_packages
 
 if TYPE_CHECKING:
     from .config import Baseline, Task
 
-__all__ = ["Loaded", "load_extended", "load_robot", "read_robot", "stated_baseline", "welded_to"]
+__all__ = ["Loaded", "impossible_said", "load_extended", "load_robot", "read_robot", "stated_baseline", "welded_to"]
 
 
 class Loaded(NamedTuple):
@@ -57,17 +57,18 @@ def read_robot(
     gravity: Sequence[float] | None = None,
     root: Root | None = None,
     packages: Sequence[str | Path] = (),
+    *,
+    kinematic: bool = False,
 ) -> RobotModel:
     """Rigid bodies of the robot in a `.urdf`, `.xml` (MJCF) or `.usd` file: `load_urdf`, `load_mjcf`, `load_usd`.
 
-    `gravity` and `root` None: as the file has them, which for URDF is (0, 0, -9.81) and a fixed root. Raises
-    `InputError` for other files, and as those two do.
+    `gravity` and `root` None: as the file has them, which for URDF is (0, 0, -9.81) and a fixed root. `kinematic` as
+    in `load_urdf`; the others refuse impossible inertias anyway. Raises `InputError` for other files, and as those do.
     """
     form = model_format(path)
     if form == "urdf":
-        return load_urdf(
-            path, joints, posture, (0.0, 0.0, -9.81) if gravity is None else gravity, root or "fixed", packages
-        )
+        down = (0.0, 0.0, -9.81) if gravity is None else gravity
+        return load_urdf(path, joints, posture, down, root or "fixed", packages, kinematic=kinematic)
     return (load_usd if form == "usd" else load_mjcf)(path, joints, posture, gravity, root, packages)
 
 
@@ -123,8 +124,10 @@ def load_extended(
         raise InputError(f"{file}: {error}") from None
 
 
-def load_robot(task: Task) -> RobotModel:
+def load_robot(task: Task, *, kinematic: bool = False) -> RobotModel:
     """The robot of a task, joints locked and ordered as it says; gravity is an MJCF's own where the task gives none.
+
+    `kinematic`: for postures alone, as in `load_urdf`; `impossible_said` tells what was wrong then.
 
     >>> import figaroh_jax as fj
     >>> fj.load_robot(fj.load_task(fj.DEMO.replace("robot.urdf", "task.yaml"))).nv
@@ -141,7 +144,22 @@ def load_robot(task: Task) -> RobotModel:
         raise InputError(f"{task.file}: robot.model {error}") from None
     from .config import robot_options
 
-    return read_robot(task.robot.model, **robot_options(task.robot))
+    return read_robot(task.robot.model, **robot_options(task.robot), kinematic=kinematic)
+
+
+def impossible_said(path: str | Path, packages: Sequence[str | Path] = ()) -> tuple[str, ...]:
+    """A note on each link whose moments of inertia no body can have, in a file that is read for postures alone.
+
+    Postures ask for none: the weight of a link, which bends compliant joints, takes mass and centre of mass alone.
+    """
+    urdf = model_format(path) == "urdf"
+    lines = impossible_moments(find_in_packages(path, packages)) if urdf else ()
+    return tuple(
+        f"{Path(path).name}: {line}, which no body can have; postures do not depend on it (a link's weight takes mass"
+        " and centre of mass alone). A calibration's robot.urdf keeps it, its robot.xml has the nearest that a body can"
+        " have; tasks of torques refuse the file"
+        for line in lines
+    )
 
 
 def welded_to(robot: RobotModel, path: str | Path, root: Root | None = None) -> tuple[Welded, ...]:

@@ -64,6 +64,8 @@ def load_urdf(
     gravity: Sequence[float] = (0.0, 0.0, -9.81),
     root: Root = "fixed",
     packages: Sequence[str | Path] = (),
+    *,
+    kinematic: bool = False,
 ) -> RobotModel:
     """Model of the robot in a URDF file, its root link fixed to the world or free (`root="free_flyer"`).
 
@@ -77,7 +79,8 @@ def load_urdf(
     joint it follows. Every link and every joint of the file is a frame of the model. Masses and inertias of links that
     do not move are left out: they do no work. Damping and friction of `<dynamics>` are not part of this model:
     `load_extended`. Meshes are never read; `packages` are the folders of packages by which a path such as
-    `package://my_robot/robot.urdf` is found.
+    `package://my_robot/robot.urdf` is found. `kinematic`: for postures alone, which ask for no moments of inertia:
+    links whose moments no body can have pass as they are in the file.
 
     Raises `InputError` naming the file and the joint or link that is wrong.
 
@@ -87,16 +90,16 @@ def load_urdf(
     """
     check_names("joints", joints)
     path = find_in_packages(path, packages)
-    name, parts = urdf_parts(path)
+    name, parts = urdf_parts(path, kinematic=kinematic)
     return assemble(str(path), name, parts, joints, posture, gravity, root)
 
 
-def urdf_parts(path: str | Path) -> tuple[str, tuple[list[LinkPart], list[JointPart]]]:
-    """Name of the robot in a URDF file, its links and its joints."""
+def urdf_parts(path: str | Path, *, kinematic: bool = False) -> tuple[str, tuple[list[LinkPart], list[JointPart]]]:
+    """Name of the robot in a URDF file, its links and its joints; `kinematic` as in `load_urdf`."""
     robot = _read(path)
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # `assemble` checks what comes of it
-            links = [_link(link) for link in robot.iterchildren("link")]
+            links = [_link(link, kinematic) for link in robot.iterchildren("link")]
             joints = [_joint(joint) for joint in robot.iterchildren("joint")]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -117,6 +120,11 @@ def urdf_dynamics(path: str | Path) -> dict[str, tuple[float, float]]:
                     )
             found[joint.get("name")] = (float(element.get("damping", 0)), float(element.get("friction", 0)))
     return found
+
+
+def impossible_moments(path: str | Path) -> tuple[str, ...]:
+    """The links of the file whose moments of inertia no body can have, a line on each."""
+    return tuple(filter(None, (_negative_moment(link) for link in _read(path).iterchildren("link"))))
 
 
 def said_twice(path: str | Path) -> tuple[str, ...]:
@@ -201,19 +209,33 @@ def _check_numbers(element: Any, attribute: str, count: int, where: str) -> None
         raise InputError(f"{place} is '{text}'; finite numbers are expected")
 
 
-def _link(link: Any) -> LinkPart:
+def _link(link: Any, kinematic: bool) -> LinkPart:
     name, inertial = str(link.get("name")), link.find("inertial")
     if inertial is None:
         return LinkPart(name, np.zeros(10))
     mass = float(inertial.find("mass").get("value"))
-    moments = {key: float(value) for key, value in inertial.find("inertia").attrib.items() if key in _MOMENTS}
-    about_com = np.array([[moments[key] for key in row.split()] for row in _ROWS])
     if mass < 0.0:
         raise InputError(f"link '{name}': its mass is {mass:g} kg; it cannot be negative")
-    principal = np.linalg.eigvalsh(about_com)
-    if principal[0] < -_ROUNDED * max(1.0, principal[-1]):
-        raise InputError(f"link '{name}': its inertia has a negative principal moment, {principal[0]:.3g} kg m^2")
-    return LinkPart(name, inertia.transform(inertia.from_com(mass, np.zeros(3), about_com), _origin(inertial)))
+    if not kinematic and (wrong := _negative_moment(link)):
+        raise InputError(wrong)
+    about_com = inertia.from_com(mass, np.zeros(3), _moments(inertial))
+    return LinkPart(name, inertia.transform(about_com, _origin(inertial)))
+
+
+def _moments(inertial: Any) -> np.ndarray:
+    """Inertia (3, 3) about the centre of mass, kg m^2."""
+    moments = {key: float(value) for key, value in inertial.find("inertia").attrib.items() if key in _MOMENTS}
+    return np.array([[moments[key] for key in row.split()] for row in _ROWS])
+
+
+def _negative_moment(link: Any) -> str:
+    """What no body can have of the moments of a link; empty: nothing."""
+    if (inertial := link.find("inertial")) is None:
+        return ""
+    principal = np.linalg.eigvalsh(_moments(inertial))
+    if principal[0] >= -_ROUNDED * max(1.0, principal[-1]):
+        return ""
+    return f"link '{link.get('name')}': its inertia has a negative principal moment, {principal[0]:.3g} kg m^2"
 
 
 def _joint(joint: Any) -> JointPart:

@@ -62,7 +62,7 @@ def draft_task(
 
     Raises `InputError` for what cannot be read, and `Undecided` for what the data do not decide.
     """
-    whole = read_robot(model)
+    whole = read_robot(model, kinematic=True)  # torques refuse below what postures do without
     for name in joints or ():
         if name not in whole.joint_names:
             raise InputError(f"--joints: robot '{whole.name}' has no joint '{name}'{nearest(name, whole.joint_names)}")

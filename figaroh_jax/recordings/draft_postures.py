@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from ..errors import InputError
 from ..formats.config import load_task
-from ..formats.robotfile import read_robot
+from ..formats.robotfile import impossible_said, read_robot
 from ..rigid.kinematics import poses_on_host
 from ..rigid.model import RobotModel, prismatic
 from .draft_columns import column_kinds, holds, of_joints, words_of
@@ -84,7 +84,7 @@ def draft_postures(
     if arm is None:
         raise InputError("no recordings given")
     entries = _with_roles(entries, shapes, assumed)
-    assumed += locked_said(arm.robot, whole)
+    assumed += [*locked_said(arm.robot, whole), *impossible_said(model)]
     named = joints is None and all(isinstance(entry["position"], list) for entry in entries)
     if not named:
         assumed.append(f"columns belong to {', '.join(arm.joints)}, in this order")
@@ -303,7 +303,7 @@ class _Arm(NamedTuple):
 
 def _arm(model: Path, whole: RobotModel, joints: tuple[str, ...]) -> _Arm:
     keys = {"model": str(model.resolve())} | ({} if joints == whole.joint_names else {"joints": [*joints]})
-    robot = read_robot(model, joints)
+    robot = read_robot(model, joints, kinematic=True)
     still = [f.name for f in robot.frames if f.parent < 0]
     base = next((name for name in ("base_link", "base", "world") if name in still), None)
     base = base or next((name for name in still if "joint" not in name), still[0] if still else robot.frames[0].name)

@@ -278,7 +278,7 @@ def _calibration(found: dict[str, Any], get: Callable[..., Any], model: Path, co
     place = next((p for p in (config.parent / file, config.parent.parent / file) if p.is_file()), config.parent / file)
     axes = get("measure", "measurable_dof") or [True] * 3
     markers = max(1, sum(path.rsplit(".", 1)[-1] in ("measure", "measurable_dof") for path in found))
-    known = read_robot(model)
+    known = read_robot(model, kinematic=True)
     entry: dict[str, Any] = {"file": str(place.resolve())}
     names = _header(place)
     entry["position"] = [name for name in names if name in known.joint_names] or list(known.joint_names)

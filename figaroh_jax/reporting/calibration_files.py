@@ -181,7 +181,7 @@ def _parity(calibration: Calibration, urdf: Path) -> float:
     """Largest difference (m) of the file, read back, from the calibrated model in 100 random postures."""
 
     model = calibration.model
-    again = load_urdf(urdf, joints=model.joint_names, posture=calibration.posture)
+    again = load_urdf(urdf, joints=model.joint_names, posture=calibration.posture, kinematic=True)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (100, model.nv))
     off = float(np.abs(np.asarray(forward_kinematics(model, q)) - np.asarray(forward_kinematics(again, q))).max())
     if not off < _PARITY:

@@ -128,12 +128,13 @@ def view_of(folder: Path) -> tuple[RobotView, Motions]:
     nominal = motions = None
     if task.is_file():
         loaded = load_task(task)
-        nominal = load_robot(loaded)
+        nominal = load_robot(loaded, kinematic=True)
         motions = _motions(loaded, nominal)
     if (folder / "model" / "effects.yaml").is_file():
         robot = load_model(folder / "model").robot
     else:
-        robot = read_robot(folder / "model" / "robot.urdf", None if nominal is None else nominal.joint_names)
+        names = None if nominal is None else nominal.joint_names
+        robot = read_robot(folder / "model" / "robot.urdf", names, kinematic=True)
     if nominal is not None and nominal.joint_names != robot.joint_names:
         nominal = None
     return RobotView(robot, _said(causes), nominal), motions or {}

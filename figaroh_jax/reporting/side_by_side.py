@@ -246,7 +246,7 @@ def _links(folders: Sequence[Path]) -> Iterator[tuple[str, ...]]:
     for folder in folders:
         path = folder / "model" / "robot.urdf"
         table: dict[str, tuple[float, ...]] = {}
-        robot = load_urdf(path) if path.is_file() else None
+        robot = load_urdf(path, kinematic=True) if path.is_file() else None
         for link, ten in zip(robot.link_names, np.asarray(robot.inertia), strict=True) if robot is not None else ():
             mass, com, about = to_com(ten) if ten[0] > 0 else (0.0, np.zeros(3), np.zeros((3, 3)))
             table[f"{link}: mass, kg"] = (float(mass),)
