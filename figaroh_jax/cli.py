@@ -384,3 +384,7 @@ def _set_up_jax(cache: bool) -> None:
         from .compiled.executable_cache import keep_programs
 
         keep_programs()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import math
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice
@@ -67,8 +69,40 @@ def check_each(name: str, given: Any, kind: type | tuple[type, ...], hint: str) 
     check_list(name, given)
     for one in given:
         if not isinstance(one, kind):
-            named = " or a ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
-            raise InputError(f"{name}: a {named} is expected, got a {type(one).__name__}: {hint}")
+            raise InputError(f"{name}: {_a(kind)} is expected, got a {type(one).__name__}: {hint}")
+
+
+def check_kind(name: str, given: Any, kind: type | tuple[type, ...], hint: str) -> None:
+    """Refuse what is of none of the kinds; the message ends in what would be right."""
+    if not isinstance(given, kind):
+        told = f"the text '{given[:100]}'" if isinstance(given, str) else f"of type {type(given).__name__}"
+        raise InputError(f"{name} is {told}; {_a(kind)} is expected: {hint}")
+
+
+def _a(kind: type | tuple[type, ...]) -> str:
+    names = [one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,))]
+    return " or ".join(f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}" for name in names)
+
+
+def check_path(name: str, given: Any) -> None:
+    """Refuse what is no path: neither text nor what `os` takes as one."""
+    if not isinstance(given, (str, os.PathLike)):
+        kind = type(given).__name__
+        raise InputError(f"{name} is {None if given is None else f'of type {kind}'}; the path of a file is expected")
+
+
+def check_positive(name: str, given: Any, unit: str) -> None:
+    """Refuse all but one finite number above zero; what JAX traces passes."""
+    if isinstance(given, bool | str | bytes) or getattr(given, "ndim", 0):
+        wrong = True
+    else:
+        try:
+            wrong = not 0 < float(given) < math.inf
+        except (TypeError, ValueError) as error:
+            wrong = not (type(error).__module__.partition(".")[0] == "jax")
+    if wrong:
+        told = f"the text '{given[:100]}'" if isinstance(given, str) else f"{given!r:.100}"
+        raise InputError(f"{name} is {told}; expected a number of {unit} above zero")
 
 
 def check_names(name: str, given: Any) -> None:

@@ -209,8 +209,9 @@ def test_compiled_programs_are_kept_in_the_users_cache_folder(tmp_path: Path):
     assert run.stdout.split() == [str(tmp_path / "figaroh_jax" / "jax"), "True", "float64"]
 
 
-def test_the_package_runs_as_a_module():
-    run = subprocess.run([sys.executable, "-m", "figaroh_jax", "--version"], capture_output=True, text=True)
+@pytest.mark.parametrize("module", ["figaroh_jax", "figaroh_jax.cli"])
+def test_the_package_runs_as_a_module(module: str):
+    run = subprocess.run([sys.executable, "-m", module, "--version"], capture_output=True, text=True)
     assert (run.returncode, run.stdout[:12], run.stderr) == (0, "figaroh-jax ", "")
 
 

@@ -10,7 +10,7 @@ before). Position sensors read more than the truth by the sum of the `position_e
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -21,9 +21,10 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from ..compiled.batching import on_host
 from ..compiled.precision import in_float64
 from ..errors import InputError, check_real
-from ..rigid.dynamics import inverse_dynamics
+from ..rigid.dynamics import inverse_dynamics, refuse_singular
 from ..rigid.kinematics import states
 from ..rigid.model import RobotModel
 from .base import Effect, Motion, changed, exact, fixed, movable
@@ -76,9 +77,23 @@ class ExtendedModel(eqx.Module):
         """Accelerations (rad/s^2 or m/s^2) under the drives' torques `tau`: `inverse_dynamics` solved for `a`.
 
         Newton's method with the exact Jacobian; the derivatives are those of the solution (implicit function theorem).
-        At v = 0 dry friction is taken as zero: a joint that sticks is the business of `simulate`.
+        At v = 0 dry friction is taken as zero: a joint that sticks is the business of `simulate`. Raises `InputError`
+        where neither link nor rotor gives a joint mass, but under jit, grad and vmap, where the answer is NaN or huge.
         """
-        return _forward_dynamics(opened(self), *states(self.robot, q=q, v=v, tau=tau))
+        model, given = opened(self), states(self.robot, q=q, v=v, tau=tau)
+        answer = _forward_dynamics(model, *given)
+        if on_host(self, given):
+            refuse_singular(answer, given, self.robot.dof_names, lambda row: _masses(model, given, row))
+        return answer
+
+
+def _masses(model: Any, given: Sequence[Any], row: int) -> Float[np.ndarray, "nv nv"]:
+    """Mass matrix of robot and effects in one of the states (q, v, tau)."""
+    q, v = (np.reshape(x, (-1, np.shape(x)[-1]))[row] for x in given[:2])
+    ways: Any = np.concatenate([np.zeros((1, len(v))), np.eye(len(v))])
+    still: Any = [np.tile(x, (len(ways), 1)) for x in (q, v)]
+    torque = np.asarray(_inverse_dynamics(model, still[0], still[1], ways))
+    return (torque[1:] - torque[0]).T
 
 
 def _where(robot: RobotModel, effect: Effect) -> list[str]:

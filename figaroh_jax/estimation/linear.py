@@ -22,7 +22,7 @@ from ..compiled.linear_algebra import symmetric_solve
 from ..compiled.precision import in_float64
 from ..effects.base import Effect, Motion, columns, movable
 from ..effects.extended import ExtendedModel, extend
-from ..errors import InputError
+from ..errors import InputError, check_kind, check_real
 from ..recordings.rowfilter import filtered
 from ..rigid.model import RobotModel
 from ..rigid.regressor import dense_rows
@@ -78,6 +78,7 @@ def linear_basis(model: RobotModel | ExtendedModel, data: TorqueData, tolerance:
     True
     """
     whole = model if isinstance(model, ExtendedModel) else extend(model)
+    check_kind("data", data, TorqueData, "`torque_data` makes it of recordings")
     if traced(whole, data):
         raise InputError("linear_basis decides ranks on the host: call it outside of jit, grad and vmap")
     with jax.enable_x64(True):
@@ -107,6 +108,8 @@ def linear_limits(model: ExtendedModel, basis: Basis) -> tuple[Float[np.ndarray,
     >>> float(lower[-1]), float(upper[-1])
     (0.0, inf)
     """
+    check_kind("model", model, ExtendedModel, "`extend` makes one; linear_limits(model, basis)")
+    check_kind("basis", basis, Basis, "`linear_basis` makes one")
     lower = [-np.inf] * (10 * len(model.robot.joints))
     for effect in model.effects:
         lower += [p.lower for p in effect.parameters().values() if p.linear]
@@ -143,6 +146,11 @@ def fit_linear(
     True
     """
     whole = model if isinstance(model, ExtendedModel) else extend(model)
+    check_kind("data", data, TorqueData, "`torque_data` makes it of recordings")
+    check_kind("basis", basis, Basis, "`linear_basis` makes one")
+    for name, given in {"counts": counts, "lower": lower, "upper": upper}.items():
+        if given is not None:
+            check_real(name, given)
     products, rows = _products(whole, data, basis)
     weight = jnp.ones(len(rows)) if counts is None else jnp.asarray(counts, float)
     if weight.shape != (len(rows),):
@@ -194,6 +202,12 @@ def _limits(
 ) -> tuple[Array, Array, Int[np.ndarray, " limited"]]:
     """Both limits of every parameter, and which have one: all where a transformation holds the limits."""
     given = [x for x in (lower, upper) if x is not None]
+    for name, limits in (("lower", lower), ("upper", upper)):
+        if limits is not None and np.shape(limits) not in ((), (rank,)):
+            raise InputError(
+                f"{name} has shape {np.shape(limits)}; one number is expected, or {rank}: one for each of the basis'"
+                " names (`linear_limits`)"
+            )
     low = jnp.full(rank, -jnp.inf) if lower is None else jnp.broadcast_to(jnp.asarray(lower, float), (rank,))
     high = jnp.full(rank, jnp.inf) if upper is None else jnp.broadcast_to(jnp.asarray(upper, float), (rank,))
     if traced(*given):

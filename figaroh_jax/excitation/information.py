@@ -19,7 +19,7 @@ from ..compiled.batching import program
 from ..compiled.precision import in_float64
 from ..effects.base import Effect
 from ..effects.extended import ExtendedModel, require_single_axes
-from ..errors import InputError, nearest
+from ..errors import InputError, check_kind, check_positive, nearest
 from ..estimation.base_parameters import base_parameters
 from ..estimation.columns import column_names, friction_terms, random_states
 from ..estimation.priors import rigid_prior
@@ -190,6 +190,8 @@ def information_matrix(learned: Learned, motion: Trajectory | States, rate: floa
 
     `motion` is a `Trajectory`, or its arrays q, v, a of shape (samples, nv).
     """
+    check_kind("learned", learned, Learned, "`learn(model)` makes one")
+    check_positive("rate", rate, "Hz")
     return _gram(learned, *(jnp.asarray(x) for x in _states(motion, rate))) + jnp.asarray(learned.prior)
 
 
@@ -224,6 +226,7 @@ def information(
     >>> bool(of(0.3) > of(0.1)), bool(jax.grad(of)(0.1) > 0)  # larger motions tell more
     (True, True)
     """
+    check_kind("model", model, (RobotModel, ExtendedModel), "information(model, motion, learned)")
     matrix = information_matrix(learn(model) if learned is None else learned, motion, rate)
     return 2.0 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(matrix))))
 

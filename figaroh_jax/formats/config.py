@@ -6,7 +6,7 @@ file and key. The models can also be built in Python: `Preprocess(cutoff=15)`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError,
 
 from ..errors import InputError, nearest
 from .excite_keys import Excite, MotionBasis, MotionLimits, SizedEffect
-from .fields import Effect, Keys, Number, Positive, Vector
+from .fields import Effect, Keys, Number, Positive, Vector, mistake
 from .files import USD
 from .recording_keys import Load, Measurement, Preprocess, RecordingEntry, Transmission, Units
 from .taskfile import given_task, merge, read_task, where
@@ -285,7 +285,7 @@ def load_limits(path: str | Path) -> Limits:
     try:
         return Limits.model_validate(merge(chain))
     except ValidationError as error:
-        place, text = _mistake(error.errors(include_url=False))
+        place, text = mistake(error.errors(include_url=False))
         raise InputError(f"{where(chain, place)}: {text}") from None
 
 
@@ -308,7 +308,7 @@ def load_task(path: str | Path | Mapping[str, Any]) -> Task:
     try:
         task = Task.model_validate(merge(chain))
     except ValidationError as error:
-        place, text = _mistake(error.errors(include_url=False))
+        place, text = mistake(error.errors(include_url=False))
         raise InputError(f"{where(chain, place)}: {text}") from None
     task._file = chain[-1][0]
     return task
@@ -319,61 +319,3 @@ def robot_options(robot: Robot) -> dict[str, Any]:
     own = robot.model.suffix.lower() in (".xml", *USD) and "gravity" not in robot.model_fields_set
     gravity = None if own else robot.gravity
     return {"joints": robot.joints, "posture": dict(robot.posture), "gravity": gravity, "root": robot.root}
-
-
-_EXPECTED = {  # pydantic's kinds of mistakes, in fewer words
-    "greater_than": "more than {gt:g}",
-    "greater_than_equal": "at least {ge:g}",
-    "less_than": "less than {lt:g}",
-    "literal_error": "{expected}",
-    "too_long": "{max_length} values",
-    "float_type": "a number",
-    "float_parsing": "a number",
-    "int_type": "a whole number",
-    "int_parsing": "a whole number",
-    "int_from_float": "a whole number",
-    "finite_number": "a finite number",
-    "string_type": "text",
-    "bool_type": "true or false",
-    "bool_parsing": "true or false",
-    "tuple_type": "a list",
-    "list_type": "a list",
-    "dict_type": "keys and values",
-    "path_type": "the name of a file",
-}
-
-
-def _mistake(errors: Sequence[Any]) -> tuple[tuple[str | int, ...], str]:
-    """Place and text of the first mistake; where a key takes one of several forms, of all of them together."""
-    place = _keys(errors[0]["loc"])
-    if len(place) == len(errors[0]["loc"]):
-        return place, _message(place, errors[0], _expected(errors[0]))
-    same = [error for error in errors if _keys(error["loc"])[: len(place)] == place]
-    depth = max(len(_keys(error["loc"])) for error in same)
-    near = [error for error in same if len(_keys(error["loc"])) == depth]  # of the form that was meant
-    forms = list(dict.fromkeys(_expected(error) for error in near))
-    text = " or ".join([", ".join(forms[:-1]), forms[-1]] if len(forms) > 1 else forms)
-    place = _keys(near[0]["loc"])
-    return place, _message(place, near[0], text)
-
-
-def _keys(place: Sequence[str | int]) -> tuple[str | int, ...]:
-    """Of a place, the keys of the task file, without the forms that pydantic tells apart."""
-    return tuple(part for part in place if isinstance(part, int) or "[" not in part)
-
-
-def _expected(error: Any) -> str:
-    kind = error["type"]
-    if kind == "value_error":
-        return str(error["ctx"]["error"]).removeprefix("expected ")
-    return _EXPECTED[kind].format(**error.get("ctx", {})) if kind in _EXPECTED else error["msg"]
-
-
-def _message(place: Sequence[str | int], error: Any, expected: str) -> str:
-    """One mistake in the words of the task file."""
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
-    if error["type"] == "missing":
-        return f"{key} is missing"
-    if error["type"] == "value_error":
-        return f"{key}: {error['ctx']['error']}" if key else str(error["ctx"]["error"])
-    return f"{key} is {error['input']!r:.80}, expected {expected}"

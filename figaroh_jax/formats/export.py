@@ -21,7 +21,7 @@ from jaxtyping import Int
 from ..effects.base import Effect, joint_unit, place
 from ..effects.catalogue import find
 from ..effects.extended import ExtendedModel, changed_robot, extend
-from ..errors import InputError
+from ..errors import InputError, check_kind, check_path
 from ..results import Cause, Estimate, Name
 from ..rigid.model import DOF_NAMES, RobotModel
 from .mjcf_text import mjcf_text
@@ -70,6 +70,8 @@ def write_model(model: ExtendedModel | RobotModel, directory: str | Path, causes
     ...     fj.load_model(folder).robot.nv
     4
     """
+    check_kind("model", model, (ExtendedModel, RobotModel), "write_model(model, directory)")
+    check_path("directory", directory)
     directory = Path(directory)
     texts = model_files(extend(model) if isinstance(model, RobotModel) else model, causes)
     directory.mkdir(parents=True, exist_ok=True)

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from ..errors import nearest
+from ..errors import InputError, nearest
 from .taskfile import CONTRACT_EFFECTS
 
-__all__ = ["Columns", "Effect", "Keys", "Label", "Matrix", "MatrixOrDiagonal", "Number", "Positive", "Vector"]
+__all__ = [
+    "Columns",
+    "Effect",
+    "Keys",
+    "Label",
+    "Matrix",
+    "MatrixOrDiagonal",
+    "Number",
+    "Positive",
+    "Vector",
+    "mistake",
+]
 
 
 def _not_bool(value: Any) -> Any:
@@ -55,7 +67,22 @@ Matrix = list[list[Number]]
 MatrixOrDiagonal = Annotated[Matrix, BeforeValidator(_diagonal)]  # a plain list is a diagonal
 
 
-class Keys(BaseModel):
+class _Called(type(BaseModel)):  # pyright: ignore[reportUntypedBaseClass, reportGeneralTypeIssues]
+    """Wrong arguments of a call from Python are one `InputError`, as those of a file are."""
+
+    if not TYPE_CHECKING:
+
+        def __call__(cls, *args: Any, **keys: Any) -> Any:
+            if args:
+                named = ", ".join(f"{key}=..." for key in cls.model_fields)
+                raise InputError(f"{cls.__name__} takes its arguments by name: {cls.__name__}({named})")
+            try:
+                return super().__call__(**keys)
+            except ValidationError as error:
+                raise InputError(f"{cls.__name__}: {mistake(error.errors(include_url=False))[1]}") from None
+
+
+class Keys(BaseModel, metaclass=_Called):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @model_validator(mode="before")
@@ -69,3 +96,61 @@ class Keys(BaseModel):
         elif not isinstance(value, BaseModel):
             raise ValueError(f"expected keys and values: {', '.join(known)}")
         return value
+
+
+_EXPECTED = {  # pydantic's kinds of mistakes, in fewer words
+    "greater_than": "more than {gt:g}",
+    "greater_than_equal": "at least {ge:g}",
+    "less_than": "less than {lt:g}",
+    "literal_error": "{expected}",
+    "too_long": "{max_length} values",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "finite_number": "a finite number",
+    "string_type": "text",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "dict_type": "keys and values",
+    "path_type": "the name of a file",
+}
+
+
+def mistake(errors: Sequence[Any]) -> tuple[tuple[str | int, ...], str]:
+    """Place and text of the first mistake; where a key takes one of several forms, of all of them together."""
+    place = _keys(errors[0]["loc"])
+    if len(place) == len(errors[0]["loc"]):
+        return place, _message(place, errors[0], _expected(errors[0]))
+    same = [error for error in errors if _keys(error["loc"])[: len(place)] == place]
+    depth = max(len(_keys(error["loc"])) for error in same)
+    near = [error for error in same if len(_keys(error["loc"])) == depth]  # of the form that was meant
+    forms = list(dict.fromkeys(_expected(error) for error in near))
+    text = " or ".join([", ".join(forms[:-1]), forms[-1]] if len(forms) > 1 else forms)
+    place = _keys(near[0]["loc"])
+    return place, _message(place, near[0], text)
+
+
+def _keys(place: Sequence[str | int]) -> tuple[str | int, ...]:
+    """Of a place, the keys of the task file, without the forms that pydantic tells apart."""
+    return tuple(part for part in place if isinstance(part, int) or "[" not in part)
+
+
+def _expected(error: Any) -> str:
+    kind = error["type"]
+    if kind == "value_error":
+        return str(error["ctx"]["error"]).removeprefix("expected ")
+    return _EXPECTED[kind].format(**error.get("ctx", {})) if kind in _EXPECTED else error["msg"]
+
+
+def _message(place: Sequence[str | int], error: Any, expected: str) -> str:
+    """One mistake in the words of the task file."""
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
+    if error["type"] == "missing":
+        return f"{key} is missing"
+    if error["type"] == "value_error":
+        return f"{key}: {error['ctx']['error']}" if key else str(error["ctx"]["error"])
+    return f"{key} is {error['input']!r:.80}, expected {expected}"

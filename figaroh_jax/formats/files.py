@@ -6,7 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from ..errors import InputError, nearest
+from ..errors import InputError, check_path, nearest
 
 __all__ = ["USD", "model_format", "plain_file", "read_file"]
 
@@ -15,6 +15,7 @@ USD = (".usd", ".usda", ".usdc", ".usdz")
 
 def model_format(path: str | Path) -> str:
     """Format of a robot's file by its name, `urdf`, `mjcf` or `usd`; `InputError` for other names."""
+    check_path("path", path)
     suffix = Path(path).suffix.lower()
     known = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf"} | dict.fromkeys(USD, "usd")
     if suffix not in known:

@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from ..errors import InputError, check_real, nearest
+from ..errors import InputError, check_positive, check_real, nearest
 from ..rigid.model import RobotModel
 from . import poses
 from .dataset import Memory, Recording, unit_factors
@@ -242,9 +242,8 @@ def _clock(time: Any, rate: float | None, samples: int, source: Memory, seconds:
     if (time is None) == (rate is None):
         raise InputError(f"{source}: give time or rate, one of the two")
     if time is None:
-        if rate is None or not 0 < rate < np.inf:
-            raise InputError(f"{source}: rate is {rate}; expected a number of Hz above zero")
-        return np.arange(samples) / rate
+        check_positive(f"{source}: rate", rate, "Hz")
+        return np.arange(samples) / float(rate or 0)
     stamps = _numbers(time, "time", source) * seconds
     if stamps.shape != (samples,):
         raise InputError(f"{source}: time has shape {stamps.shape}, expected ({samples},)")

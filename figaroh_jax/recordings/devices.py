@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..errors import InputError, check_each, check_kind
 from ..rigid import lie
 from ..rigid.model import Leaf
 
@@ -321,8 +322,22 @@ def own_device(
     >>> [name for name, unit, size in device.unknowns()]
     ['eyelet x', 'eyelet y', 'eyelet z']
     """
-    names = tuple((name, unit, float(size)) for name, (_, unit, size) in unknowns.items())
-    return _Own(np.array([start for start, _, _ in unknowns.values()], float), residual, names, tuple(channels))
+    if not callable(residual):
+        raise InputError(f"residual is of type {type(residual).__name__}; residual(pose, unknown, datum) is expected")
+    check_kind("unknowns", unknowns, Mapping, "{'offset': (start, unit, about how far off)}")
+    check_each("channels", channels, int, "one number for each row: POSITION or ORIENTATION")
+    names, starts = [], []
+    for name, given in unknowns.items():
+        try:
+            start, unit, size = given
+            starts.append(float(start))
+            names.append((str(name), str(unit), float(size)))
+        except (TypeError, ValueError):
+            raise InputError(
+                f"unknowns['{name}'] is {given!r:.100}; its start, its unit and about how far off that is are expected,"
+                " (1.0, 'm', 0.1) say"
+            ) from None
+    return _Own(np.array(starts), residual, tuple(names), tuple(channels))
 
 
 def _frame(name: str) -> tuple[tuple[str, str, float], ...]:

@@ -7,6 +7,7 @@ kernels the sample is the last axis; the public functions take any leading batch
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from math import prod
 
 import jax
@@ -18,6 +19,7 @@ from jaxtyping import Array, Float
 from ..compiled.batching import on_host, over_samples, to_device, two_axes
 from ..compiled.machine_code import machine_code, own_room
 from ..compiled.precision import in_float64
+from ..errors import InputError
 from .inertia import pseudo_inertia
 from .kinematics import Motion, add_up, ancestors, axis_twists, check_shapes, gather, motion, movers, pose_columns, take
 from .model import RobotModel
@@ -32,10 +34,13 @@ __all__ = [
     "joint_masses",
     "joint_torques",
     "mass_matrix",
+    "refuse_singular",
     "torques_on_host",
 ]
 
 MOST_JOINTS = 12  # of a robot whose mass matrix is factorised in registers
+_HUGE = 1e12  # rad/s^2, m/s^2 and other numbers: beyond it a mass matrix is looked at
+_NO_MASS = 1e-13  # of the largest number of a mass matrix
 MANY = 512  # samples from which a program is worth its compilation that is written out for the robot at hand
 
 
@@ -163,8 +168,9 @@ def forward_dynamics(
 ) -> Float[Array, "*batch nv"]:
     """Accelerations (rad/s^2, m/s^2) that the torques `tau` (N m, N) give the rigid body; inverse of inverse_dynamics.
 
-    Cholesky solve with the mass matrix, in float64. Where a joint moves no mass that matrix is singular and the answer
-    is NaN or huge: give the link an inertia (or the joint a rotor). Raises `InputError` where the shapes do not fit.
+    Cholesky solve with the mass matrix, in float64. Where a joint moves no mass that matrix is singular: give the link
+    an inertia (or the joint a rotor). Raises `InputError` there and where the shapes do not fit; under jit, grad and
+    vmap, and on a GPU, nothing looks at the numbers, and the answer is NaN or huge.
 
     >>> import numpy as np, figaroh_jax as fj
     >>> robot = fj.load_urdf(fj.DEMO)
@@ -175,7 +181,41 @@ def forward_dynamics(
     """
     check_shapes(model, q=q, v=v, tau=tau)
     form = _ACCELERATIONS if len(model.joints) <= MOST_JOINTS else None
-    return over_samples(joint_accelerations, model, q, v, tau, width=model.nv**2, straight=form)
+    answer = over_samples(joint_accelerations, model, q, v, tau, width=model.nv**2, straight=form)
+    if on_host(model, q, v, tau):
+        rows = np.reshape(q, (-1, model.nq))
+        refuse_singular(answer, (q, v, tau), model.dof_names, lambda row: mass_matrix(model, rows[row]))
+    return answer
+
+
+def refuse_singular(
+    answer: Float[ArrayLike, "*batch nv"],
+    states: Sequence[Float[ArrayLike, "*batch _"]],
+    names: Sequence[str],
+    masses_at: Callable[[int], Float[ArrayLike, "nv nv"]],
+) -> None:
+    """Raise `InputError` where a mass matrix has given no accelerations; NaN or huge for NaN or huge numbers may pass.
+
+    `states` are what the accelerations `answer` were asked of, `names` those of their columns, `masses_at` the matrix
+    of a row.
+    """
+    if (np.abs(np.asarray(answer)) < _HUGE).all():
+        return
+    rows = (np.reshape(np.asarray(x), (-1, np.shape(x)[-1])) for x in (*states, answer))
+    sane = [np.asarray((np.abs(x) < _HUGE).all(axis=1)) for x in rows]
+    wrong = np.flatnonzero(np.all(sane[:-1], axis=0) & ~sane[-1])
+    if not len(wrong) or not np.isfinite(masses := np.asarray(masses_at(int(wrong[0])))).all():
+        return
+    moved = np.diagonal(masses)
+    still = [name for name, x in zip(names, moved, strict=True) if not x > _NO_MASS * moved.max()]
+    if still or not np.linalg.cond(masses) < 1 / _NO_MASS:
+        which = "some joints move one body alike"
+        if still:
+            which = f"joint{'s' * (len(still) > 1)} {', '.join(still)} move{'s' * (len(still) == 1)} no mass"
+        row = f" in row {wrong[0]}" if len(sane[-1]) > 1 else ""
+        raise InputError(
+            f"the mass matrix is singular{row}: {which}; give the link an inertia (or the joint a rotor), or lock it"
+        )
 
 
 def joint_accelerations(
