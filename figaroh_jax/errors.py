@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from typing import Any
@@ -67,7 +67,7 @@ def check_list(name: str, given: Any) -> None:
 def check_each(name: str, given: Any, kind: type | tuple[type, ...], hint: str) -> None:
     """Refuse what is not a list of things of one kind; the message ends in how one is made."""
     check_list(name, given)
-    for one in given:
+    for one in [given] if isinstance(given, str) else given:
         if not isinstance(one, kind):
             raise InputError(f"{name}: {_a(kind)} is expected, got a {type(one).__name__}: {hint}")
 
@@ -82,6 +82,13 @@ def check_kind(name: str, given: Any, kind: type | tuple[type, ...], hint: str) 
 def _a(kind: type | tuple[type, ...]) -> str:
     names = [one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,))]
     return " or ".join(f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}" for name in names)
+
+
+def check_one_of(name: str, given: Any, known: Sequence[str]) -> None:
+    """Refuse what is none of the known words."""
+    if given not in known:
+        near = nearest(given, known) if isinstance(given, str) else f"; known: {', '.join(known)}"
+        raise InputError(f"{name} is {given!r:.100}{near}")
 
 
 def check_path(name: str, given: Any) -> None:
@@ -106,7 +113,9 @@ def check_positive(name: str, given: Any, unit: str) -> None:
 
 
 def check_names(name: str, given: Any) -> None:
-    """Refuse one text where a list of names is expected: its letters would be taken for names."""
+    """Refuse what is no list of names where one is expected; of one text the letters would be taken for names."""
+    if not (given is None or isinstance(given, Iterable)):
+        raise InputError(f"{name} is {given!r:.100}; a list of names is expected")
     if isinstance(given, str):
         raise InputError(f"{name} is the text '{given[:100]}'; a list is expected, of one name too: ['{given[:100]}']")
 

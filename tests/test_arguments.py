@@ -33,6 +33,13 @@ def robot_with(name: str, value: Any) -> Any:
 
 
 ANY: Any = fj
+
+
+def seen(**wrong: Any) -> Any:
+    """Postures with wrong arguments."""
+    return fj.postures(**({"q": Q, "position": Q[:, :3], "base_frame": "base", "tool_frame": "hand"} | wrong))
+
+
 WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "gravity": (lambda: fj.inverse_dynamics(robot_with("gravity", np.zeros(2)), Q, Q, Q), r"model.gravity .*\(2,\)"),
     "batch": (lambda: fj.mass_matrix(robot_with("inertia", np.zeros((3, 4, 10))), Q), "model.inertia .* jax.vmap"),
@@ -77,6 +84,54 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: refuse_singular(np.array([[0.0, 0.0], [np.nan, 1.0]]), [np.ones((2, 2))], ("a", "b"), lambda row: ONES),
         "singular in row 1: some joints move one body alike",
     ),
+    "units": (
+        lambda: fj.recording(q=Q, tau=Q, rate=100, units={"positon": "deg"}),
+        "'positon'; did you mean 'position'",
+    ),
+    "unit": (
+        lambda: ANY.recording(q=Q, tau=Q, rate=100, units="deg"),
+        "units is the text 'deg'; a Mapping is expected",
+    ),
+    "role": (lambda: ANY.recording(q=Q, tau=Q, rate=100, role="test"), "role is 'test'; known: fit, holdout"),
+    "load": (
+        lambda: ANY.recording(q=Q, tau=Q, rate=100, load=2.0),
+        r"load is of type float; a Load .* fj.Load\(frame=",
+    ),
+    "names": (lambda: fj.recording(q=Q, tau=Q, rate=100, joints="elbow"), "joints is the text 'elbow'; a list"),
+    "extended": (lambda: ANY.recording(q=Q, tau=Q, rate=100, model=MODEL), "ExtendedModel; a RobotModel .* `.robot`"),
+    "unknown frame": (lambda: seen(unknown="base_frame"), "unknown is the text 'base_frame'; a list is expected"),
+    "base": (lambda: seen(base_frame=None), "base_frame is of type NoneType; a str is expected: the name of a frame"),
+    "accuracy": (lambda: seen(accuracy=1e-3), "accuracy is 0.001; two are expected: one sigma in m and one in rad"),
+    "mount": (lambda: seen(mount="tool"), "mount is 'tool'; known: hand, world"),
+    "function": (lambda: seen(device=abs), "device is of type builtin_function_or_method; a Device .*`own_device`"),
+    "task": (lambda: ANY.load_robot({"robot": 1}), "task is of type dict; a Task is expected: `load_task` reads one"),
+    "posture": (lambda: ANY.load_urdf(fj.DEMO, posture=["elbow"]), "posture is of type list; a Mapping is expected"),
+    "angle": (lambda: ANY.load_urdf(fj.DEMO, posture={"elbow": "1"}), "the position of joint 'elbow' holds text"),
+    "folder": (lambda: ANY.load_model(ROBOT), "directory is of type RobotModel; the path of a file"),
+    "write loop": (lambda: ANY.write_loop(ROBOT, "out"), r"RobotModel; a Loop is expected: `load_loop`"),
+    "sigma": (
+        lambda: fj.torque_data(ROBOT, RUN, noise=np.ones(3)),
+        "one sigma above zero is expected .*for each joint",
+    ),
+    "pose data": (lambda: ANY.pose_data(ROBOT, [RUN]), "recordings: a PoseRecording is expected, got a Recording"),
+    "no data": (lambda: ANY.residual(MODEL, "run.npz"), "data is str: expected recordings, postures or"),
+    "free": (lambda: ANY.fit(MODEL, DATA, 3), "free is 3; one or several of inertia"),
+    "candidates": (lambda: ANY.select(MODEL, DATA, None), "candidates is one NoneType; a list is expected"),
+    "way to fit": (lambda: ANY.identify(ROBOT, [RUN], fit="phys"), "fit is 'phys'; did you mean 'physical'"),
+    "nothing": (lambda: fj.identify(ROBOT, []), "recordings is empty"),
+    "nothing to diagnose": (lambda: fj.diagnose(ROBOT, []), "recordings is empty"),
+    "calibrated": (lambda: ANY.calibrate(MODEL, []), "ExtendedModel; a RobotModel .* holds one as `.robot`"),
+    "diagnosed": (lambda: ANY.diagnose(MODEL, [RUN]), "ExtendedModel; a RobotModel or a backend of one is expected"),
+    "forbid": (lambda: fj.diagnose(ROBOT, [RUN], forbid="backlash"), "forbid is the text 'backlash'; a list"),
+    "known": (lambda: ANY.learn(ROBOT, "viscous"), "known is the text 'viscous'; a Baseline is expected"),
+    "noise": (lambda: ANY.learn(ROBOT, noise="a"), "noise is the text 'a'; expected a number of relative one sigma"),
+    "points": (lambda: ANY.spline("4", 3.0), "points is the text '4'; an int"),
+    "duration": (lambda: fj.spline(4, 0.0), "duration is 0.0; expected a number of s above zero"),
+    "limit": (lambda: ANY.limits_of(ROBOT, velocity=[1, 2]), r"limits.velocity is \[1, 2\]; a number for all joints"),
+    "objective": (lambda: ANY.excite(ROBOT, fj.spline(4, 2.0), objective="dopt"), "objective is 'dopt'; .*condition"),
+    "instrument": (lambda: ANY.excite_postures(ROBOT, "pose"), "instrument is the text 'pose'; an Instrument"),
+    "no effect": (lambda: ANY.register(ROBOT), "a class of effects is expected"),
+    "grid": (lambda: ANY.shape("rad", 3), "grid is 3; the values from which the search starts"),
     "loop": (lambda: ANY.rollout(ROBOT, Q, Q[0]), "loop is of type RobotModel; `load_loop`"),
 }
 

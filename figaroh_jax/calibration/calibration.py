@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..effects.kinematic import HISTORY
-from ..errors import InputError, check_each, nearest
+from ..errors import InputError, check_each, check_kind, check_names, nearest
 from ..estimation import marginal
 from ..estimation.gravity import without_far_masses
 from ..estimation.posegroups import Measured, assemble, postures_of
@@ -94,7 +94,11 @@ def calibrate(
     >>> round(found.solution.parameters["joint_offset shoulder"].value, 4)
     0.02
     """
+    check_kind("model", model, RobotModel, "load_urdf reads one; an ExtendedModel holds one as `.robot`")
     check_each("recordings", recordings, PoseRecording, "`postures` makes one of arrays")
+    if not len(recordings):
+        raise InputError("recordings is empty: there is nothing to calibrate by")
+    check_names("forbid", forbid)
     notes = check_pose_recordings(None, model, recordings)
     found = _calibrated(model, recordings, forbid, progress, level, priors)
     return replace(found, notes=(*notes, *found.notes))

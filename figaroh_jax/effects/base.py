@@ -219,6 +219,8 @@ def shape(
     >>> Notch.parameters()["width"].grid
     (0.05, 0.1, 0.2)
     """
+    if isinstance(grid, str) or not isinstance(grid, Sequence) or not len(grid):
+        raise InputError(f"grid is {grid!r:.100}; the values from which the search starts are expected, (0.1, 0.2) say")
     lower, upper = bounds or (min(grid), max(grid))
     parameter = Parameter(unit, False, lower, upper, tuple(grid), choice, hole)
     return eqx.field(default=grid[0], metadata={"parameter": parameter})

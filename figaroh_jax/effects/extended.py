@@ -173,7 +173,7 @@ def predict(
 
 def check_period(dt: Any) -> None:
     """Raise `InputError` where a step or a period (s) is known and not above zero."""
-    if not isinstance(dt, Tracer) and not float(dt) > 0:
+    if isinstance(dt, str) or (not isinstance(dt, Tracer) and not float(dt) > 0):
         raise InputError(f"dt is {dt}; the time from one sample to the next is expected, above zero, in s")
 
 

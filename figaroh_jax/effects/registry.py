@@ -49,6 +49,8 @@ def register(effect: type[Effect]) -> type[Effect]:
     >>> fj.CATALOGUE["drag"] is Drag
     True
     """
+    if not isinstance(effect, type) or not hasattr(effect, "levels"):
+        raise InputError(f"register is given {effect!r:.100}; a class of effects is expected: class Drag(fj.Effect)")
     if (CATALOGUE | _OTHERS | POSES | ROLLOUTS).get(effect.name, effect).__qualname__ != effect.__qualname__:
         raise InputError(f"an effect called '{effect.name}' is registered already")
     if "torque" in effect.levels:

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Shaped
 from ..compiled.precision import in_float64
 from ..effects.extended import ExtendedModel, changed_robot, extend, opened, read_position, read_sensors
 from ..effects.kinematic import PostureMotion, Postures, twists_of
-from ..errors import InputError, check_each
+from ..errors import InputError, check_each, check_kind, check_real
 from ..recordings.checks import check_columns, position_findings, report_findings
 from ..recordings.dataset import Recording
 from ..recordings.devices import Device
@@ -236,6 +236,9 @@ def torque_data(
     if not fitted or lacking is not None:
         raise InputError(f"{lacking.file} has no torque" if lacking else "no recording to fit: all have role holdout")
     _belong(robot, fitted)
+    check_real("noise", noise)
+    if np.shape(noise) not in ((), (robot.nv,)) or not (np.asarray(noise) > 0).all():
+        raise InputError(f"noise is {noise!r:.100}; one sigma above zero is expected (N m or N), or one for each joint")
     signals = prepare_all(tuple(fitted), preprocess or Preprocess(), band=None, model=robot, sticks=False)
     records = stack(signals, robot)
     places = records.source.shape[1]
@@ -296,6 +299,9 @@ def pose_data(
     True
     """
     robot = model.robot if isinstance(model, ExtendedModel) else model
+    check_kind("model", model, (RobotModel, ExtendedModel), "pose_data(model, recordings)")
+    if not isinstance(recordings, PoseRecording):
+        check_each("recordings", recordings, PoseRecording, "`postures` makes one of arrays")
     given = [recordings] if isinstance(recordings, PoseRecording) else list(recordings)
     each_joint = robot.nq == robot.nv and all(one.position.shape[1] == robot.nv for one in given)
     if each_joint:  # else the kinematics refuse it
@@ -323,7 +329,7 @@ def as_data(model: ExtendedModel, data: Any) -> tuple[Data, ...]:
         return pose_data(model, data)
     if isinstance(data, Data):
         return (data,)
-    if not isinstance(data, Sequence) or not len(data):
+    if not isinstance(data, Sequence) or isinstance(data, str | bytes) or not len(data):
         raise InputError(
             f"data is {type(data).__name__}: expected recordings, postures or an object with a method `residual(model)`"
         )

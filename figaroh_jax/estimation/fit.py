@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from ..compiled.batching import DRAFT_OPTIONS, FEW, on_host, traced
 from ..compiled.precision import in_float64
 from ..effects.extended import ExtendedModel, extend
-from ..errors import InputError
+from ..errors import InputError, check_real
 from ..rigid.chain import chain_between
 from ..rigid.model import Leaf, RobotModel
 from . import posefit
@@ -212,6 +212,8 @@ def _precision(free: Free, model: ExtendedModel, prior: Mapping[str, Any]) -> Fl
         kind = known.get(part.kind, part.kind)
         sigma = prior.get(kind, prior.get("friction") if kind == "effects" else None)
         unused -= {kind} | ({"friction"} if kind == "effects" else set())
+        if sigma is not None:
+            check_real(f"prior: sigma of '{kind}'", sigma)
         if sigma is None:
             out.append(np.zeros(len(part.index)))
         elif kind == "inertia" and np.ndim(sigma) == 0:

@@ -15,7 +15,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -130,6 +130,8 @@ def chosen_of(model: ExtendedModel, data: Sequence[Data], free: Any) -> Free:
     """
     if isinstance(free, Free):
         return free
+    if not isinstance(free, Iterable):
+        raise InputError(f"free is {free!r:.100}; one or several of {', '.join(KINDS)} are expected, or a mapping")
     wanted: dict[str, Any] = dict(free) if isinstance(free, Mapping) else {}
     if not wanted:
         wanted = {kind: True for kind in ([free] if isinstance(free, str) else free)}

@@ -22,7 +22,7 @@ from ..compiled.linear_algebra import symmetric_solve
 from ..compiled.precision import in_float64
 from ..effects.base import Effect, Motion, columns, movable
 from ..effects.extended import ExtendedModel, extend
-from ..errors import InputError, check_kind, check_real
+from ..errors import InputError, check_kind, check_positive, check_real
 from ..recordings.rowfilter import filtered
 from ..rigid.model import RobotModel
 from ..rigid.regressor import dense_rows
@@ -79,6 +79,8 @@ def linear_basis(model: RobotModel | ExtendedModel, data: TorqueData, tolerance:
     """
     whole = model if isinstance(model, ExtendedModel) else extend(model)
     check_kind("data", data, TorqueData, "`torque_data` makes it of recordings")
+    if tolerance is not None:
+        check_positive("tolerance", tolerance, "what counts as zero, relative")
     if traced(whole, data):
         raise InputError("linear_basis decides ranks on the host: call it outside of jit, grad and vmap")
     with jax.enable_x64(True):

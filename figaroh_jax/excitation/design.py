@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from ..effects.base import Effect
 from ..effects.extended import ExtendedModel
-from ..errors import InputError
+from ..errors import InputError, check_kind, check_one_of, check_real
 from ..rigid.model import RobotModel
 from .information import Learned, learn
 from .limits import Limits, Torque, limits_of, unmeetable
@@ -118,6 +118,11 @@ def excite(
     """
     if not isinstance(basis, Basis):
         raise InputError(f"basis is of type {type(basis).__name__}; `fourier`, `spline` and `quintic` make one")
+    named: Any = objective
+    if isinstance(named, str):
+        check_one_of("objective", named, get_args(Objective))
+    for name, number in {"starts": starts, "trajectories": trajectories}.items():
+        check_kind(name, number, (int, np.integer), "how many")
     asked = _asked(model, limits, learned, start)
     with jax.enable_x64(True):
         aim = _aim(asked, basis, objective, predict, separate, trust, rate)
@@ -156,9 +161,14 @@ def _asked(
     start: Sequence[float] | np.ndarray | None,
 ) -> _Asked:
     """What is asked for, with its defaults; `InputError` where no motion can keep the limits."""
+    check_kind("model", model, (RobotModel, ExtendedModel), "excite(model, basis)")
     robot = model.robot if isinstance(model, ExtendedModel) else model
     limits = limits_of(robot) if limits is None else limits
+    check_kind("limits", limits, Limits, "`limits_of` makes them")
     learned = learn(model) if learned is None else learned
+    check_kind("learned", learned, Learned, "`learn(model)` makes one")
+    if start is not None:
+        check_real("start", start)
     begin = None if start is None else _inside(robot, np.asarray(start, float), limits)
     limits = _without(limits, robot, learned.held, begin)
     sampler = Sampler(robot, learned.terms, np.asarray(learned.width))

@@ -101,6 +101,10 @@ def learn(
     """
     from ..formats.config import Baseline
 
+    check_kind("model", model, (RobotModel, ExtendedModel), "load_urdf reads one")
+    check_kind("known", known or Baseline(), Baseline, "Baseline(viscous=True), say")
+    if trust is not None:
+        check_positive("trust", trust, "relative one sigma")
     robot, effects = (model.robot, model.effects) if isinstance(model, ExtendedModel) else (model, ())
     require_single_axes(robot, "a motion that is designed")
     terms = friction_terms(robot, known or Baseline())
@@ -154,6 +158,8 @@ def _sigmas(robot: RobotModel, noise: float | Mapping[str, float]) -> Float[np.n
     if not (np.isfinite(largest) & (largest > 0)).all():
         typical = np.abs(np.asarray(inverse_dynamics(robot, *random_states(robot, 256)))).max(axis=0)
         largest = np.where(np.isfinite(largest) & (largest > 0), largest, typical)
+    for one in noise.values() if isinstance(noise, Mapping) else [noise]:
+        check_positive("noise", one, "relative one sigma")
     if not isinstance(noise, Mapping):
         return float(noise) * largest
     for name in noise:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import InputError, nearest
+from ..errors import InputError, check_kind, check_positive, nearest
 from ..rigid.model import RobotModel
 from .certified import nearest_approaches
 from .clearance import Clearance
@@ -112,6 +112,8 @@ def limits_of(
     >>> float(limits.velocity[robot.joint_names.index("elbow")])
     0.9
     """
+    check_kind("robot", robot, RobotModel, "load_urdf reads one; an ExtendedModel holds one as `.robot`")
+    check_positive("scale", scale, "times the limits")
     given = {
         "velocity": _by_joint(robot, "velocity", velocity, np.asarray(robot.velocity_limit, float)),
         "acceleration": _by_joint(robot, "acceleration", acceleration, np.full(robot.nv, np.inf)),
@@ -158,9 +160,15 @@ def open_limits(robot: RobotModel, limits: Limits, given: Mapping[str, Given]) -
 def _by_joint(robot: RobotModel, kind: str, given: Any, own: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
     if given is None:
         return np.full(robot.nv, np.inf)
+    if isinstance(given, str) and given != "model":
+        raise InputError(
+            f"limits.{kind} is the text '{given[:100]}'; a number, a map by joint, None or 'model' is expected"
+        )
     if isinstance(given, str):
         return np.where(own > 0, own, np.inf) if kind != "acceleration" else own
     if not isinstance(given, Mapping):
+        if np.ndim(given):
+            raise InputError(f"limits.{kind} is {given!r:.100}; a number for all joints is expected, or a map by joint")
         return np.full(robot.nv, float(given))
     out = np.where(own > 0, own, np.inf)  # as `model` has the joints that the map leaves out
     for name, value in given.items():

@@ -18,7 +18,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from ..errors import InputError
+from ..errors import InputError, check_kind, check_positive
 from ..rigid.model import Leaf
 
 __all__ = ["Basis", "Trajectory", "fourier", "quintic", "spline"]
@@ -53,6 +53,7 @@ class Basis(NamedTuple):
 
     def instants(self, rate: float) -> Float[np.ndarray, " samples"]:
         """Times from the beginning to the end, `rate` (Hz) a second."""
+        check_positive("rate", rate, "Hz")
         return np.arange(round(self.duration * rate) + 1) / rate
 
     def peaks(self, rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -79,6 +80,9 @@ def fourier(harmonics: int, base: float, duration: float) -> Basis:
     >>> fj.fourier(5, base=0.1, duration=10.0).size  # numbers a joint
     8
     """
+    check_kind("harmonics", harmonics, (int, np.integer), "how many functions a joint has")
+    check_positive("base", base, "Hz")
+    check_positive("duration", duration, "s")
     if harmonics < 2 or not base > 0:
         raise InputError(
             f"a Fourier basis of {harmonics} harmonics of {base:g} Hz: at least 2 of more than 0 Hz needed"
@@ -102,6 +106,8 @@ def spline(points: int, duration: float) -> Basis:
     >>> basis.at([0.0, 3.0]).shape  # position, velocity and acceleration of four functions, at both ends
     (3, 2, 4)
     """
+    check_kind("points", points, (int, np.integer), "how many functions a joint has")
+    check_positive("duration", duration, "s")
     if points < 2:
         raise InputError(f"a spline with {points} free control points: at least 2 are needed")
     return Basis("spline", points, float(duration))
@@ -116,6 +122,8 @@ def quintic(waypoints: int, duration: float) -> Basis:
     >>> fj.quintic(5, duration=8.0).size  # numbers a joint: the first waypoint is the start
     4
     """
+    check_kind("waypoints", waypoints, (int, np.integer), "how many functions a joint has")
+    check_positive("duration", duration, "s")
     if waypoints < 2:
         raise InputError(f"a quintic with {waypoints} waypoints: at least 2 are needed, the start among them")
     return Basis("quintic", waypoints, float(duration))
@@ -147,12 +155,14 @@ class Trajectory(eqx.Module):
 
         Linear in `start` and `weights`.
         """
+        check_kind("basis", self.basis, Basis, "`fourier`, `spline` and `quintic` make one")
         return self.at(self.basis.instants(rate))
 
     def at(
         self, time: Float[ArrayLike, " samples"]
     ) -> tuple[Float[Array, "*batch samples nv"], Float[Array, "*batch samples nv"], Float[Array, "*batch samples nv"]]:
         """As `states`, at the given times (s)."""
+        check_kind("basis", self.basis, Basis, "`fourier`, `spline` and `quintic` make one")
         matrix, joints = self.basis.at(np.asarray(time)), np.shape(self.start)[-1:]
         if np.shape(self.weights)[-2:] != (*joints, self.basis.size):
             raise InputError(

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from ..calibration.candidates import geometry_columns
 from ..calibration.gauge import find_gauge
 from ..effects.kinematic import Column
-from ..errors import InputError
+from ..errors import InputError, check_kind
 from ..estimation import posefit
 from ..estimation.posegroups import Measured, assemble, postures_of
 from ..recordings.arrays import postures as recorded
@@ -293,6 +293,10 @@ def excite_postures(
     >>> found.position.shape, found.logdet > found.random_logdet
     ((12, 4), True)
     """
+    check_kind("model", model, RobotModel, "load_urdf reads one; an ExtendedModel holds one as `.robot`")
+    check_kind(
+        "instrument", instrument, Instrument, "Instrument('position', base_frame='base', tool_frame='hand'), say"
+    )
     limits = np.array(model.position_limit if position_limit is None else position_limit, float)
     limits = np.where(np.isfinite(limits), limits, [-np.pi, np.pi])
     generator = np.random.default_rng(seed)

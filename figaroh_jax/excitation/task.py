@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from ..errors import InputError
+from ..errors import InputError, check_kind
 from ..formats.collision import read_shapes
 from ..formats.config import Task, robot_options
 from ..formats.excite_keys import Excite, Sight, SizedEffect
@@ -54,6 +54,7 @@ def excite_task(
     >>> len(found.stages)
     1
     """
+    check_kind("task", task, Task, "`load_task` reads one")
     asked = task.excite
     if separate:
         asked = excite_block(asked)

@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import InputError, nearest
+from ..errors import InputError, check_kind, check_names, check_real, nearest
 from ..rigid import inertia
 from ..rigid.model import DOF_NAMES, NUMBERS, Frame, Joint, Kind, RobotModel
 
@@ -287,11 +287,14 @@ def _locked(
     drives: Mapping[str, _Drive], fixed: Sequence[str], joints: Sequence[str] | None, posture: Posture
 ) -> dict[str, float | Sequence[float]]:
     """Position of every independent joint that does not move, where the posture gives one."""
+    check_names("joints", joints)
     for name in joints or ():
         _independent(name, drives, fixed, "joints")
     _unique(list(joints or ()), "of the moving joints")
+    check_kind("posture", posture, Mapping, "{'elbow': 0.5}, in rad or m")
     for name, value in posture.items():
         _independent(name, drives, fixed, "posture")
+        check_real(f"posture: the position of joint '{name}'", value)
         if not np.isfinite(value).all():
             raise InputError(f"posture: joint '{name}' is at {value}; a finite position is expected")
         if joints is not None and name in joints:

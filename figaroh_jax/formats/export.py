@@ -216,6 +216,7 @@ def load_model(directory: str | Path) -> ExtendedModel:
     ...     fj.load_model(folder).robot.joint_names[0]
     'waist'
     """
+    check_path("directory", directory)
     directory = Path(directory)
     if not directory.is_dir():
         raise InputError(f"{directory} is not a folder; a model folder with effects.yaml and robot.urdf is expected")

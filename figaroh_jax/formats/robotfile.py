@@ -16,7 +16,7 @@ import numpy as np
 from ..effects.base import Effect, place
 from ..effects.catalogue import find
 from ..effects.extended import ExtendedModel, extend
-from ..errors import InputError
+from ..errors import InputError, check_kind
 from ..rigid.model import RobotModel
 from .assembly import LARGEST_NUMBER, Posture, Root, Welded, welded_bodies
 from .compensation import GravityCompensation
@@ -138,12 +138,13 @@ def load_robot(task: Task, *, kinematic: bool = False) -> RobotModel:
             f"load_robot takes a task, as load_task reads it, and '{task}' is a path: load_urdf, load_mjcf or load_usd"
             " reads the file of a robot"
         )
+    from .config import Task, robot_options
+
+    check_kind("task", task, Task, "`load_task` reads one")
     try:
         model_format(task.robot.model)
     except InputError as error:
         raise InputError(f"{task.file}: robot.model {error}") from None
-    from .config import robot_options
-
     return read_robot(task.robot.model, **robot_options(task.robot), kinematic=kinematic)
 
 

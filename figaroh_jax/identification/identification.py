@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import jax
 import numpy as np
@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from ..effects.base import Effect
 from ..effects.friction import CoulombFriction
 from ..effects.plausibility import implausible
-from ..errors import InputError, check_each, check_names, nearest
+from ..errors import InputError, check_each, check_names, check_one_of, nearest
 from ..estimation.base_parameters import BaseParameters, base_parameters, essential
 from ..estimation.columns import friction_terms, structural_columns
 from ..estimation.conic import Body, NotConverged
@@ -180,6 +180,9 @@ def identify(
 
     check_each("recordings", recordings, Recording, "`recording` makes one of arrays")
     check_each("preprocess", [preprocess or Preprocess()], Preprocess, "Preprocess(cutoff=15), in Hz, say")
+    check_one_of("fit", fit, get_args(Fit))
+    if not len(recordings):
+        raise InputError("recordings is empty: there is nothing to fit")
     backend = as_backend(model)
     model = backend.robot
     warned = check_recordings(None, model, recordings) if check else ()

@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from ..errors import InputError, check_positive, check_real, nearest
+from ..errors import InputError, check_kind, check_names, check_one_of, check_positive, check_real, nearest
 from ..rigid.model import RobotModel
 from . import poses
 from .dataset import Memory, Recording, unit_factors
@@ -59,6 +59,9 @@ def recording(
     ((500, 4), 'fit')
     """
     source = Memory(name)
+    _check_words(joints, units, ("position", "velocity", "time"), role, load)
+    if model is not None:
+        check_kind("model", model, RobotModel, "load_urdf reads one; an ExtendedModel holds one as `.robot`")
     names = tuple(joints or (model.dof_names if model is not None else ()))
     given = {"v": v, "tau": tau, "command": command}
     arrays = {"q": _matrix(q, "q", source)}
@@ -73,8 +76,6 @@ def recording(
     known = dict(units or {})
     seconds = _unit(known.pop("time", "s"), SECONDS, "time", source)
     angle, speed = known.pop("position", "rad"), known.pop("velocity", None)
-    if known:
-        raise InputError(f"{source}: units has no '{next(iter(known))}'; known: position, velocity, time")
     stamps = _clock(time, rate, samples, source, seconds)
     _check_pace(stamps, source)
     return Recording(
@@ -124,6 +125,17 @@ def postures(
     'position'
     """
     source = Memory(name)
+    _check_words(unknown, units, ("position", "measurement"), role, load, "unknown")
+    for key, frame in {"base_frame": base_frame, "tool_frame": tool_frame}.items():
+        check_kind(key, frame, str, "the name of a frame of the model")
+    for one in unknown:
+        check_one_of("unknown", one, ("base_frame", "tool_frame"))
+    check_one_of("mount", mount, ("hand", "world"))
+    if device is not None:
+        check_kind("device", device, Device, "`own_device` makes one of your function")
+    if distance is not None:
+        check_positive("distance", distance, "m")
+    _check_accuracy(accuracy)
     position = _matrix(q, "q", source)
     known = dict(units or {})
     scale = _unit(known.pop("measurement", "m"), {"m": 1.0, "mm": 1e-3}, "measurement", source)
@@ -147,6 +159,29 @@ def postures(
         device=device,
         carried="camera" in kinds and poses.carried("camera", mount),
     )
+
+
+def _check_words(names: Any, units: Any, known: Sequence[str], role: Any, load: Any, called: str = "joints") -> None:
+    """Raise `InputError` for what is no list of names, units that are not known, another role, or no load."""
+    check_names(called, names)
+    if units is not None:
+        check_kind("units", units, Mapping, '{"position": "deg"}, say')
+        for key, unit in units.items():
+            check_one_of("a key of units", key, known)
+            check_kind(f"units['{key}']", unit, str, '"deg", say')
+    check_one_of("role", role, ("fit", "holdout"))
+    if load is not None:
+        from ..formats.recording_keys import Load
+
+        check_kind("load", load, Load, "fj.Load(frame='hand', mass=2.0), in kg")
+
+
+def _check_accuracy(accuracy: Any) -> None:
+    if isinstance(accuracy, str) or not hasattr(accuracy, "__len__") or len(accuracy) != 2:
+        raise InputError(f"accuracy is {accuracy!r:.100}; two are expected: one sigma in m and one in rad, or None")
+    for sigma, unit in zip(accuracy, ("m", "rad"), strict=True):
+        if sigma is not None:
+            check_positive("accuracy", sigma, unit)
 
 
 class _Table(NamedTuple):

@@ -16,7 +16,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..errors import InputError, nearest
+from ..errors import InputError, check_kind, nearest
 from ..formats.assembly import ROOT_JOINT
 from ..rigid.inertia import from_com, transform
 from ..rigid.model import RobotModel
@@ -114,6 +114,9 @@ def read_recordings(
     >>> runs[0].name, runs[0].torque.shape[1]
     ('first_1', 4)
     """
+    check_kind("model", model, RobotModel, "read_recordings(task, load_robot(task))")
+    if not hasattr(task, "preprocess"):
+        raise InputError(f"task is of type {type(task).__name__}; `load_task` reads one: read_recordings(task, model)")
     _check_names(task, model, floating, "commands" if rollouts else "joint torques")
     drive = Drive(task, model)
     every = (_read(entry, f"data[{k}]", model, drive, driven) for k, entry in enumerate(task.data))

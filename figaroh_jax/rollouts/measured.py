@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from ..effects.base import Effect
 from ..effects.extended import ExtendedModel, changed_robot
-from ..errors import InputError, nearest
+from ..errors import InputError, check_each, check_kind, nearest
 from ..recordings.checks import position_findings, report_findings
 from ..recordings.dataset import Recording
 from ..rigid.model import Leaf, RobotModel
@@ -126,6 +126,9 @@ def rollout_data(
     unknown = next((name for name in drives if name not in DRIVES), None)
     if unknown is not None:
         raise InputError(f"drives: no number '{unknown}'{nearest(unknown, DRIVES)}")
+    check_kind("loop", loop, Loop, "`load_loop` makes one of a robot's file and its drives")
+    if not isinstance(recordings, Recording):
+        check_each("recordings", recordings, Recording, "`recording` makes one of arrays")
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
     runs = [_run(loop, one) for one in given if one.role == "fit"]
     if not runs:

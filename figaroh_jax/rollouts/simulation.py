@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..compiled.batching import traced
-from ..errors import InputError
+from ..errors import InputError, check_real
 from ..rigid.kinematics import check_shapes
 from . import own
 from .loop import Loop, State, advance, integrated, mobility, observe
@@ -52,6 +52,7 @@ def rollout(
         raise InputError(
             f"loop is of type {type(loop).__name__}; `load_loop` makes one of a robot's file and its drives"
         )
+    check_real("command", command)
     with jax.enable_x64(True):
         u = jnp.asarray(command, jnp.float64)
         count = len(loop.drives.names)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..effects.base import Effect, place
 from ..effects.registry import find
-from ..errors import InputError
+from ..errors import InputError, check_kind, check_path
 from ..formats.export import load_model, model_files, write_model
 from ..rigid.manifold import neutral
 from ..rigid.model import RobotModel
@@ -39,6 +39,7 @@ def write_loop(loop: Loop, directory: str | Path) -> None:
     ...     sorted(file.name for file in Path(folder).iterdir())
     ['effects.yaml', 'loop.json', 'robot.urdf', 'robot.xml']
     """
+    check_kind("loop", loop, Loop, "`load_loop` makes one; write_loop(loop, directory)")
     write_model(extended_of(rigid(loop)), directory)
     add_loop(Path(directory), loop)
 
@@ -68,6 +69,7 @@ def read_loop(folder: str | Path) -> Loop:
     ...     fj.read_loop(folder).drives.names
     ('elbow',)
     """
+    check_path("folder", folder)
     file = Path(folder) / LOOP
     try:
         content = json.loads(file.read_text(encoding="utf-8"))

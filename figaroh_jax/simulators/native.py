@@ -10,6 +10,7 @@ import jax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from ..errors import InputError
 from ..rigid import derivatives, dynamics, kinematics, regressor
 from ..rigid.derivatives import TorqueDerivatives
 from ..rigid.model import RobotModel
@@ -100,4 +101,12 @@ class NativeBackend(Backend):
 
 def as_backend(model: RobotModel | Backend) -> Backend:
     """The backend itself, or `native` for a plain robot."""
-    return NativeBackend(model) if isinstance(model, RobotModel) else tried(model)
+    if isinstance(model, RobotModel):
+        return NativeBackend(model)
+    if not (isinstance(getattr(model, "robot", None), RobotModel) and hasattr(model, "joint_torque_regressor")):
+        told = f"the text '{model[:100]}'" if isinstance(model, str) else f"of type {type(model).__name__}"
+        raise InputError(
+            f"model is {told}; a RobotModel or a backend of one is expected: load_urdf reads one, an ExtendedModel"
+            " holds one as `.robot`"
+        )
+    return tried(model)
