@@ -167,7 +167,8 @@ def _check_words(names: Any, units: Any, known: Sequence[str], role: Any, load: 
     if units is not None:
         check_kind("units", units, Mapping, '{"position": "deg"}, say')
         for key, unit in units.items():
-            check_one_of("a key of units", key, known)
+            if key not in known:
+                raise InputError(f"units has no '{key}'{nearest(str(key), known)}")
             check_kind(f"units['{key}']", unit, str, '"deg", say')
     check_one_of("role", role, ("fit", "holdout"))
     if load is not None:
