@@ -332,6 +332,7 @@ def _add_tools(commands: Any) -> None:
     new.add_argument("recordings", type=Path, nargs="+", metavar="RECORDING")
     new.add_argument("--out", type=Path, metavar="TASK.yaml", help="default: the draft is printed")
     new.add_argument("--joints", help="comma-separated joints of the columns, in their order")
+    new.add_argument("--passive", help="comma-separated joints that nothing drives: their torque is zero")
     new.add_argument("--rate", type=float, metavar="HZ", help="rate of recordings that have no time column")
     new.add_argument("--constants", help="comma-separated N m per unit of the torque columns, in the joints' order")
     new.add_argument("--gears", help="comma-separated motor turns per joint turn, where positions are those of motors")

@@ -323,6 +323,16 @@ def test_numbers_without_a_header_are_told_to_have_none(made, tmp_path: Path):
         draft_task(urdf, [tmp_path / "run.txt"])
 
 
+def test_columns_whose_names_tell_too_little_are_shown(made, tmp_path: Path):
+    urdf, joints, (run, *_) = made
+    columns = {f"q_{joint}": run["position"][:, j] for j, joint in enumerate(joints)}
+    columns |= {f"m_t_{joint}": run["torque"][:, j] for j, joint in enumerate(joints)}  # no clock: it goes up and down
+    with pytest.raises(Undecided, match="which column is the time"):
+        draft_task(urdf, [table(tmp_path / "run.csv", columns)])
+    with pytest.raises(InputError, match=f"nothing was made: m_t_{joints[0]}, "):
+        draft_task(urdf, [table(tmp_path / "run.csv", columns)], rate=250.0)
+
+
 def test_fewer_columns_than_joints_are_told_how_to_name_theirs(made, tmp_path: Path):
     urdf, _, (run, *_) = made
     np.savez(tmp_path / "run.npz", t=run["time"], q=run["position"][:, :2], tau=run["torque"][:, :2])

@@ -95,6 +95,15 @@ def test_weighting_by_joint_finds_the_noise_and_is_nearer_to_the_truth(made: Mad
     np.testing.assert_allclose(found.rms, SIGMA, rtol=0.15)
 
 
+def test_a_joint_without_torque_does_not_draw_its_parameters_to_zero(made: Made):
+    X = made.X.copy()
+    X[:, 1] -= np.outer(X[:, 1] @ made.truth, made.truth * USED[1]) / (made.truth**2 @ USED[1])
+    X[:, 1] += 0.01 * np.random.default_rng(7).normal(size=(ROWS, K)) * np.abs(X[:, 1]).std(axis=0) * USED[1]
+    found = solve(Made(X, made.y * [1, 0], made.truth).condensed(), WeightedByJoint())
+    assert found.weight[1] == found.weight[0]  # by what it leaves it would weigh without end
+    np.testing.assert_allclose(found.parameters, made.truth, atol=0.1 * np.abs(made.truth).max())
+
+
 def test_ridge_and_prior_are_the_normal_equations(made: Made):
     X, y = made.dense()
     length = np.linalg.norm(X, axis=0)

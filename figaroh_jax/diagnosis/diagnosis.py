@@ -19,11 +19,10 @@ from ..compiled.memory import give_back_holes
 from ..effects.base import place
 from ..effects.catalogue import CATALOGUE, find, related
 from ..effects.plausibility import implausible
-from ..errors import InputError
 from ..formats.assembly import Welded
 from ..formats.robotfile import load_robot, stated_baseline, welded_to
 from ..recordings.bandwidth import note_on
-from ..recordings.checks import checked_recordings
+from ..recordings.checks import checked_recordings, refuse_unmeasured
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Signals, kept_out_in_vain, stands_at_times
 from ..results import Cause, Diagnosis, Experiment, Name, Nearest, Rest, Verdict
@@ -86,7 +85,7 @@ def diagnose_task(
     progress("reading", 0.0)
     model, (known, notes) = load_robot(task), stated_baseline(task)
     recordings = read_recordings(task, model)
-    _refuse_unmeasured(model, recordings)
+    refuse_unmeasured(model, recordings)
     checked = checked_recordings(task, model, recordings)
     notes = (*notes, *checked.warnings)
     options: dict[str, Any] = {
@@ -130,7 +129,7 @@ def diagnose(
     with jax.enable_x64(True):
         progress("preparing signals", 0.03)
         backend = as_backend(model)
-        _refuse_unmeasured(backend.robot, recordings)
+        refuse_unmeasured(backend.robot, recordings)
         signals, band, begun = prepared_signals(backend, recordings, preprocess, known, trust)
         here = setting_of(*begun, forbid, progress)
         ordered = sorted(recordings, key=lambda r: r.role == "holdout")
@@ -168,24 +167,6 @@ class _Judged(NamedTuple):
     sticks: bool  # whether what is left is that of joints at rest
     here: Setting  # with the weights of the answer's fit
     more: str = ""  # data that would tell what is left from noise, in words, where these do not
-
-
-def _refuse_unmeasured(robot: RobotModel, recordings: Sequence[Recording]) -> None:
-    """Refuse a joint whose torque has one value in all recordings of the fit: every joint is judged by its torque."""
-    fitted = [one for one in recordings if one.role == "fit" and one.torque is not None]
-    if not fitted:
-        return
-    torque = np.concatenate([one.torque for one in fitted if one.torque is not None])
-    dead = np.flatnonzero(np.ptp(torque, axis=0) == 0)
-    if 0 < dead.size < torque.shape[1]:  # of all joints: `check_recordings` says so
-        j = int(dead[0])
-        name, still = robot.dof_names[j], all(np.ptp(one.position[:, j]) == 0 for one in fitted)
-        instead = "identify leaves such a joint out, a diagnosis judges every joint by its torque"
-        if still:
-            instead = f"it stands still: name the others in robot.joints, and {name} in robot.posture"
-        raise InputError(
-            f"{fitted[0].file}: the torque of {name} is {torque[0, j]:g} in every row: it was not measured; {instead}"
-        )
 
 
 def _searched(

@@ -5,7 +5,7 @@ The names of the columns, what they are at random states (all that any motion co
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -44,10 +44,11 @@ STATES = 129  # more than a chunk of `batching`, so that the program of the reco
 SHORT_NAMES = {"viscous_friction": "fv", "coulomb_friction": "fc", "rotor_inertia": "Ia", "torque_offset": "off"}
 
 
-def friction_terms(model: RobotModel, known: Baseline) -> tuple[Effect, ...]:
+def friction_terms(model: RobotModel, known: Baseline, undriven: Collection[str] = ()) -> tuple[Effect, ...]:
     """The effects that a task's baseline asks for, those of every joint as one object with a leading axis.
 
-    A free joint has no drive, so the six rows of a free flyer's root have no friction.
+    A free joint has no drive, so the six rows of a free flyer's root have no friction. A joint that is `undriven` has
+    friction, but no rotor and no sensor that could be off.
 
     >>> import figaroh_jax as fj
     >>> robot = fj.load_urdf(fj.DEMO)
@@ -56,17 +57,20 @@ def friction_terms(model: RobotModel, known: Baseline) -> tuple[Effect, ...]:
     ['viscous_friction', 'coulomb_friction', 'torque_offset']
     """
     driven = [k for k, joint in enumerate(_joints(model)) if joint.kind != "free"]
-    joints = np.array(driven)[:, None]
     terms: list[Effect] = []
     for name in known.everywhere() if driven else ():
         effect = find(name)
-        terms.append(effect(joints, **{p: np.zeros(len(driven)) for p in effect.parameters()}))
+        at = [k for k in driven if name not in _OF_DRIVES or model.dof_names[k] not in undriven]
+        terms.append(effect(np.array(at)[:, None], **{p: np.zeros(len(at)) for p in effect.parameters()}))
     for entry in known.effects:
         effect = find(entry.effect)
         if not effect.amplitudes():
             raise InputError(f"baseline.effects: '{entry.effect}' has no parameter in which the torque is linear")
         terms.append(jax.tree.map(lambda x: np.asarray(x)[None], place(effect, model, entry.at)))
     return tuple(terms)
+
+
+_OF_DRIVES = ("rotor_inertia", "torque_offset")
 
 
 def _joints(model: RobotModel) -> list[Joint]:

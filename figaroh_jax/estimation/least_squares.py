@@ -180,6 +180,9 @@ def solve(
 def joint_weights(data: Condensed, theta: Float[np.ndarray, " columns"]) -> Float[np.ndarray, " nv"]:
     """Inverse of the mean squared residual of each joint; a joint without rows weighs nothing.
 
+    A joint whose torque is zero throughout, because nothing drives it, weighs as little as any other: parameters of
+    zero would leave nothing of it, so that by its own residual it would take them there.
+
     >>> import numpy as np, figaroh_jax as fj
     >>> robot = fj.load_urdf(fj.DEMO)
     >>> q, v, a = fj.columns.random_states(robot, 300)
@@ -191,7 +194,9 @@ def joint_weights(data: Condensed, theta: Float[np.ndarray, " columns"]) -> Floa
     squares, rows = data.squares(theta), data.rows
     torque = data.squares(np.zeros_like(theta))
     floor = LEAST**2 * torque + np.finfo(float).tiny
-    return np.where(rows > 0, rows / np.maximum(squares, floor), 0.0)
+    weight = np.where(rows > 0, rows / np.maximum(squares, floor), 0.0)
+    driven = (rows > 0) & (torque > 0)
+    return np.where((rows > 0) & ~driven, weight[driven].min(), weight) if driven.any() else weight
 
 
 def with_prior(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
@@ -12,6 +12,7 @@ from .taskfile import CONTRACT_EFFECTS
 
 __all__ = [
     "Columns",
+    "DrivenColumns",
     "Effect",
     "Keys",
     "Label",
@@ -37,6 +38,14 @@ def _columns(value: Any) -> Any:
     return value if isinstance(value, str) else tuple(value)
 
 
+def _driven_columns(value: Any) -> Any:
+    """Columns, with 0 in the place of a joint that nothing drives."""
+    if isinstance(value, (list, tuple)):
+        _columns([name for name in value if isinstance(name, bool) or name != 0])
+        return value
+    return _columns(value)
+
+
 def _diagonal(value: Any) -> Any:
     plain = isinstance(value, (list, tuple)) and all(isinstance(x, (int, float)) for x in value) and len(value) > 0
     if not plain:
@@ -60,6 +69,7 @@ def _label(value: Any) -> Any:
 Number = Annotated[float, BeforeValidator(_not_bool)]
 Positive = Annotated[Number, Field(gt=0)]
 Columns = Annotated[str | tuple[str, ...], BeforeValidator(_columns)]
+DrivenColumns = Annotated[str | tuple[str | Literal[0], ...], BeforeValidator(_driven_columns)]
 Effect = Annotated[str, BeforeValidator(lambda name: _effect(str(name)))]
 Label = Annotated[str, BeforeValidator(_label)]
 Vector = tuple[Number, Number, Number]

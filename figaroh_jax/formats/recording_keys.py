@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from .fields import Columns, Keys, Label, Matrix, MatrixOrDiagonal, Number, Positive, Vector
+from .fields import Columns, DrivenColumns, Keys, Label, Matrix, MatrixOrDiagonal, Number, Positive, Vector
 
 __all__ = ["Accuracy", "Load", "Measurement", "Preprocess", "RecordingEntry", "Transmission", "Units"]
 
@@ -101,7 +101,7 @@ class RecordingEntry(Keys):
     time: str | None = None  # s
     rate: Positive | None = None  # Hz
     velocity: Columns | None = None
-    torque: Columns | None = None
+    torque: DrivenColumns | None = None  # 0 in a list: nothing drives that joint
     command: Columns | None = None
     load: Load | None = None
     repeat: Label | None = None

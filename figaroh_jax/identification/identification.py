@@ -189,7 +189,9 @@ def identify(
     with jax.enable_x64(True):
         progress("preparing signals", 0.05)
         refused, left_out = _refused(model, recordings, joints)
-        terms = friction_terms(model, known or Baseline())
+        fitted = [one for one in recordings if one.role == "fit"]
+        undriven = [name for name in model.dof_names if all(name in one.undriven for one in fitted)]
+        terms = friction_terms(model, known or Baseline(), undriven)
         structure = structural_columns(model, terms)
         used = np.asarray(np.abs(structure).max(axis=0) > 0)
         progress("condensing the recordings", 0.15)
@@ -284,10 +286,11 @@ class _Read(NamedTuple):
 
     @property
     def squares(self) -> Float[np.ndarray, " fitted"]:
-        """Of the joints whose torque is fitted; none is less than 1e-12 of their sum."""
+        """Of the joints whose torque is fitted and not zero throughout; none is less than 1e-12 of their sum."""
         theta = np.zeros(len(self.wide.names))
+        told = (self.wide.rows > 0) & (self.wide.squares(theta) > 0)
         theta[: len(self.first.parameters)] = self.first.parameters
-        squares = self.wide.squares(theta)[self.wide.rows > 0]
+        squares = self.wide.squares(theta)[told]
         return np.maximum(squares, max(1e-12 * squares.sum(), 1e-300))
 
 
@@ -338,12 +341,15 @@ def _refused(
             # a root without any wrench on it is a measurement too: the robot flies
             if one.role != "fit" or one.torque is None or name in refused or name not in model.joint_names:
                 continue
+            if name in one.undriven:
+                continue
             share = np.unique(one.torque[:, j], return_counts=True)[1].max() / len(one.torque)
             if share > DEAD:
                 refused.add(name)
                 notes.append(
                     f"torque of {name} is not fitted: it is constant in {share:.0%} of {one.file}"
-                    " (dead zone, or not measured)"
+                    " (dead zone, or not measured; where nothing drives the joint, say so by 0 in the place of its"
+                    " column: `torque: [tau1, 0]`)"
                 )
     if refused >= set(names):
         raise InputError(f"no joint has a torque that can be fitted: {'; '.join(notes)}")

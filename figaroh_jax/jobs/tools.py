@@ -37,6 +37,7 @@ def new(args: argparse.Namespace) -> int:
         constants, gains = _numbers(args.constants, "--constants"), _numbers(args.kp, "--kp")
         known = {"rate": args.rate, "unit": args.unit, "topic": args.topic, "constants": constants, "gains": gains}
         known |= {"gears": _numbers(args.gears, "--gears"), "folder": args.out and args.out.parent}
+        known["passive"] = [name.strip() for name in args.passive.split(",")] if args.passive else ()
         return draft_task(args.model, args.recordings, joints=joints, drives=drives, **known)
 
     def drives(joints: Sequence[str]) -> tuple[Driven, ...]:

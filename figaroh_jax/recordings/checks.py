@@ -39,6 +39,7 @@ __all__ = [
     "check_rollouts",
     "checked_recordings",
     "position_findings",
+    "refuse_unmeasured",
     "report_findings",
 ]
 
@@ -488,7 +489,7 @@ def _torque_values(look: Look) -> Iterator[Finding]:
             " current without direction, is no torque; leave it out (a diagnosis of command and position needs none)",
         )
         return
-    dead = np.ptp(torque, axis=0) == 0
+    dead = (np.ptp(torque, axis=0) == 0) & ~np.isin(look.joints, look.recording.undriven)
     if dead.any():
         yield Finding(False, f"torque of {named(look, dead)} never changes: it was not measured there")
     effort = limits(look.model)[3]
@@ -557,3 +558,28 @@ def _clipped(look: Look) -> Iterator[Finding]:
 def _runs(flags: np.ndarray) -> np.ndarray:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
     return edges[1::2] - edges[::2]
+
+
+def refuse_unmeasured(robot: RobotModel, recordings: Sequence[Recording]) -> None:
+    """Refuse a joint whose torque has one value in all recordings of the fit: every joint is judged by its torque."""
+    fitted = [one for one in recordings if one.role == "fit" and one.torque is not None]
+    if not fitted:
+        return
+    torque = np.concatenate([one.torque for one in fitted if one.torque is not None])
+    dead = np.flatnonzero(np.ptp(torque, axis=0) == 0)
+    if 0 < dead.size < torque.shape[1]:  # of all joints: `check_recordings` says so
+        j = int(dead[0])
+        name, still = robot.dof_names[j], all(np.ptp(one.position[:, j]) == 0 for one in fitted)
+        if all(name in one.undriven for one in fitted):
+            driven = next(joint for joint in robot.dof_names if joint not in fitted[0].undriven)
+            raise InputError(
+                f"{fitted[0].file}: nothing drives {name}, and a diagnosis judges every joint by its torque. It judges"
+                " the motion instead where the task names the torque as `command`, not as `torque` (of a URDF with"
+                f" `actuator: {{{driven}: {{kind: torque}}}}`); identify takes the torque as it is"
+            )
+        instead = "identify leaves such a joint out, a diagnosis judges every joint by its torque"
+        if still:
+            instead = f"it stands still: name the others in robot.joints, and {name} in robot.posture"
+        raise InputError(
+            f"{fitted[0].file}: the torque of {name} is {torque[0, j]:g} in every row: it was not measured; {instead}"
+        )

@@ -88,6 +88,7 @@ class Recording:
     stamps: Float[np.ndarray, " all"] | None = None  # s, of all rows of the file, where some are left out or lack
     clock: Float[np.ndarray, " all"] | None = None  # s, when these rows were: the same but where rows lack
     wild: str = ""  # which rows no robot made, and what was done (see `wild`)
+    undriven: tuple[str, ...] = ()  # joints that nothing drives: that their torque is zero is known
 
     def __repr__(self) -> str:
         held = {key: getattr(self, key) for key in ("position", "velocity", "torque", "command")}
@@ -227,7 +228,8 @@ def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive, driv
         source = getattr(entry, name)
         return None if source is None else _columns(table, source, columns, f"{key}.{name}", len(position))
 
-    velocity, torque = optional("velocity", model.dof_names), optional("torque", model.dof_names)
+    velocity = optional("velocity", model.dof_names)
+    torque, undriven = _torque(table, entry, optional, model, key)
     command = _of_the_drives(table, entry.command, optional, position_names(model), [one.joint for one in driven])
     if torque is not None and units.torque in _NO_TORQUE and drive.torque is None:
         raise InputError(
@@ -250,7 +252,32 @@ def _read(entry: RecordingEntry, key: str, model: RobotModel, drive: Drive, driv
         repeat=entry.repeat,
         role=entry.role,
         notes=_clock_beside(table, entry, len(position)),
+        undriven=undriven,
     )
+
+
+def _torque(
+    table: Table,
+    entry: RecordingEntry,
+    optional: Callable[[str, Sequence[str]], np.ndarray | None],
+    model: RobotModel,
+    key: str,
+) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """Torque with a column for each joint, and the joints that nothing drives: those that have 0 for a column."""
+    source, names = entry.torque, model.dof_names
+    if source is None or isinstance(source, str) or 0 not in source:
+        return optional("torque", names), ()
+    if len(source) != len(names):
+        raise InputError(
+            f"{table.file}: {key}.torque lists {len(source)} columns, expected {len(names)}: for each of"
+            f" {', '.join(names)} its column, or 0 where nothing drives it"
+        )
+    undriven = tuple(joint for joint, column in zip(names, source, strict=True) if column == 0)
+    driven = [k for k, column in enumerate(source) if column != 0]
+    found = _columns(table, [str(source[k]) for k in driven], [names[k] for k in driven], f"{key}.torque")
+    whole = np.zeros((len(found), len(names)))
+    whole[:, driven] = found
+    return whole, undriven
 
 
 def _commanded(

@@ -52,29 +52,34 @@ def draft_task(
     gears: Sequence[float] | None = None,
     drives: Callable[[Sequence[str]], Sequence[Driven]] = lambda joints: (),
     folder: Path | None = None,
+    passive: Sequence[str] = (),
 ) -> Draft:
     """A task for `diagnose` and `identify` on these recordings; `joints` names their columns, `rate` (Hz) their clock.
 
     `constants` are N m a unit of each torque column, `gears` motor turns a joint turn where positions are those of
     motors, `gains` the proportional gains of the position servos (N m/rad), all in the order of the joints; `unit`
-    (rad, deg, m, mm) is that of the positions, `topic` that of bags. `drives` tells the drives in the model's file of
-    the joints that move; `gains` replace them. `folder` is where the task will lie: files in it are named from there.
+    (rad, deg, m, mm) is that of the positions, `topic` that of bags, `passive` are joints that nothing drives. `drives`
+    tells the drives in the model's file of the joints that move; `gains` replace them. `folder` is where the task will
+    lie: files in it are named from there.
 
     Raises `InputError` for what cannot be read, and `Undecided` for what the data do not decide.
     """
     whole = read_robot(model, kinematic=True)  # torques refuse below what postures do without
-    for name in joints or ():
-        if name not in whole.joint_names:
-            raise InputError(f"--joints: robot '{whole.name}' has no joint '{name}'{nearest(name, whole.joint_names)}")
-        if list(joints or ()).count(name) > 1:
-            raise InputError(f"--joints: '{name}' is named twice")
+    for option, given in (("--joints", joints or ()), ("--passive", passive)):
+        for name in given:
+            if name not in whole.joint_names:
+                hint = nearest(name, whole.joint_names)
+                raise InputError(f"{option}: robot '{whole.name}' has no joint '{name}'{hint}")
+            if list(given).count(name) > 1:
+                raise InputError(f"{option}: '{name}' is named twice")
     tables = read_tables(files, topic)
     first = next(tables, None)
     if first is None:
         raise InputError("no recordings given")
     if "format" not in first[1] and looks_measured(first[0], whole):
         return Draft(*draft_postures(model, whole, [first[0], *(table for table, _ in tables)], joints, unit, folder))
-    reads = read_columns(chain([first], tables), whole, joints, rate, drives if gains is None else lambda joints: ())
+    own = drives if gains is None else lambda joints: ()
+    reads = read_columns(chain([first], tables), whole, joints, rate, own, passive)
     if len({read.joints for read in reads}) > 1:
         raise InputError("the recordings hold different joints; draft a task for each kind")
     robot = read_robot(model, reads[0].joints)
@@ -86,6 +91,9 @@ def draft_task(
         )
     assumed = [*dict.fromkeys(clock_said(reads))]
     _doubt_percent(reads, unit)
+    if constants is not None and passive and len(constants) == robot.nv - len(passive):
+        of_driven = iter(constants)
+        constants = [1.0 if name in passive else next(of_driven) for name in robot.dof_names]
     for option, given in (("--constants", constants), ("--gears", gears)):
         _check_factors(option, given, robot)
     if len({tuple(one.joint for one in read.driven) for read in reads}) > 1:
@@ -94,12 +102,13 @@ def draft_task(
     stated, unit = unit is not None, _unit_of_position(robot, reads) if unit is None else _stated_unit(robot, unit)
     factor = np.where(np.array(prismatic(robot)), {"deg": 1.0, "mm": 1e-3}.get(unit, 1.0), _degrees(unit))
     reads = [_scaled(read, factor) for read in reads]
+    reads, passives = _undriven(robot, reads, passive)
     signs, said = _torques(robot, reads) if constants is None else ([*constants], ["torque constants as given"])
     if constants is None and signs is not None:
         _refuse_turned_positions(robot, reads, gears)
     actuator, more = _drives(model, robot, reads, gains)
     said += more
-    said += _refuse_what_is_wrong(robot, reads, signs, stated=constants is not None)
+    said += [*passives, *_refuse_what_is_wrong(robot, reads, signs, passive, stated=constants is not None)]
     labels = _repeats(reads)
     assumed += [*locked_said(robot, whole), *motors, unit_said(unit, robot, reads, stated)]
     assumed += [*said, *_repeats_said(reads, labels), baseline_said(reads)]
@@ -256,12 +265,14 @@ def _torques(robot: RobotModel, reads: Sequence[Columns]) -> tuple[list[float] |
         raise InputError(f"{reads[0].file}: no joint's torque changes its sign: an absolute value has no direction")
     _order(robot, reads, motions)
     scales = [_scale(robot, motions, j) for j in range(robot.nv)]
-    current = any(read.current for read in reads)
+    current, zero = any(read.current for read in reads), _zero(robot, reads)
     odd = [s for s in scales if s.told == "gravity" and not 0.3 < abs(s.value) < 3.0]
     names = robot.dof_names
     if current or odd:
         open_joints = [
-            n for n, s in zip(names, scales, strict=True) if s.told != "gravity" or s.error > 0.3 * abs(s.value)
+            n
+            for n, s in zip(names, scales, strict=True)
+            if n not in zero and (s.told != "gravity" or s.error > 0.3 * abs(s.value))
         ]
         if open_joints:
             raise Undecided(
@@ -271,9 +282,9 @@ def _torques(robot: RobotModel, reads: Sequence[Columns]) -> tuple[list[float] |
                 " by --constants (data sheet: torque constant times gear ratio), N m a unit in the order of the joints",
             )
         said = [f"torque constants by the model's gravity, no surer than its masses; {_constants(names, scales)}"]
-        return [s.value for s in scales], said
-    turned = [n for n, s in zip(names, scales, strict=True) if s.value < 0 and s.told]
-    unknown = [n for n, s in zip(names, scales, strict=True) if not s.told]
+        return [1.0 if n in zero else s.value for n, s in zip(names, scales, strict=True)], said
+    turned = [n for n, s in zip(names, scales, strict=True) if s.value < 0 and s.told and n not in zero]
+    unknown = [n for n, s in zip(names, scales, strict=True) if not s.told and n not in zero]
     said = []
     if turned:
         said.append(f"torque of {', '.join(turned)} has the opposite sign: turned by transmission.torque")
@@ -287,13 +298,18 @@ def _torques(robot: RobotModel, reads: Sequence[Columns]) -> tuple[list[float] |
     return ([-1.0 if n in turned else 1.0 for n in names] if turned else None), said
 
 
+def _unused(read: Columns) -> str:
+    """The columns of a recording that the draft has made nothing of, for the user to find the torque among them."""
+    return f"; columns of which nothing was made: {', '.join(read.unused[:12])}" if read.unused else ""
+
+
 def _without_torque(robot: RobotModel, reads: Sequence[Columns]) -> list[str]:
     lacking = next((read for read in reads if read.command is None), None)
     if lacking is not None:
         raise InputError(
             f"{lacking.file}: no column looks like a torque (tau, torque, effort), a current or a command (cmd, u,"
             " target), and `diagnose` and `identify` need one of them; name such columns so, with their joints, as"
-            f" tau_{robot.dof_names[0]} or cmd_{robot.dof_names[0]}"
+            f" tau_{robot.dof_names[0]} or cmd_{robot.dof_names[0]}{_unused(lacking)}"
         )
     said = [
         f"{read.unsigned} never changes its sign, so it is not torque: left out" for read in reads[:1] if read.unsigned
@@ -315,6 +331,36 @@ def _without_torque(robot: RobotModel, reads: Sequence[Columns]) -> list[str]:
         if names:
             said.append(f"the command at {', '.join(names)} is a {kind} ({unit}), as the model's actuators take it")
     return said
+
+
+def _zero(robot: RobotModel, reads: Sequence[Columns]) -> list[str]:
+    """Joints whose torque is zero in every row."""
+    torques = [read.torque for read in reads if read.torque is not None]
+    return [name for j, name in enumerate(robot.dof_names) if torques and not any(x[:, j].any() for x in torques)]
+
+
+def _undriven(robot: RobotModel, reads: Sequence[Columns], passive: Sequence[str]) -> tuple[list[Columns], list[str]]:
+    """The recordings with 0 in the place of the torque of joints that nothing drives, and what was assumed of them."""
+    zero = _zero(robot, reads)
+    for name in passive:
+        if name not in robot.dof_names:
+            raise InputError(f"--passive: the recordings hold no position of '{name}'")
+        if name not in zero and any(read.torque is not None for read in reads):
+            raise InputError(f"{reads[0].file}: --passive names {name}, but its torque is not zero throughout")
+    said = [f"nothing drives {name}, as stated: its torque is zero" for name in passive]
+    if left := [name for name in zero if name not in passive]:
+        said.append(
+            f"torque of {', '.join(left)} is 0 in every row: it was not measured, and `identify` leaves it out; where"
+            " nothing drives the joint, give --passive, for then the zero is a measurement"
+        )
+    out = []
+    for read in reads:
+        source = read.entry.get("torque")
+        if passive and isinstance(source, (list, tuple)):
+            listed = [0 if n in passive else c for n, c in zip(robot.dof_names, source, strict=True)]
+            read = read._replace(entry=read.entry | {"torque": listed})
+        out.append(read)
+    return out, said
 
 
 def _constants(names: Sequence[str], scales: Sequence[_Scale]) -> str:
@@ -420,7 +466,7 @@ def _refuse_turned_positions(robot: RobotModel, reads: Sequence[Columns], gears:
 
 
 def _refuse_what_is_wrong(
-    robot: RobotModel, reads: Sequence[Columns], signs: list[float] | None, *, stated: bool
+    robot: RobotModel, reads: Sequence[Columns], signs: list[float] | None, passive: Sequence[str], *, stated: bool
 ) -> list[str]:
     """The check of recordings on the draft's own reading: a draft that it would warn of is not written.
 
@@ -429,7 +475,8 @@ def _refuse_what_is_wrong(
     factor, said = np.ones(robot.nv) if signs is None else np.array(signs), list[str]()
     for read in reads:
         torque = None if read.torque is None else read.torque * factor
-        recording = Recording(read.file.stem, read.file, robot.dof_names, read.time, read.position, torque=torque)
+        of_all = (read.file.stem, read.file, robot.dof_names, read.time, read.position)
+        recording = Recording(*of_all, torque=torque, undriven=tuple(passive))
         entry = RecordingEntry(file=read.file, position="q", rate=1.0)
         grave = [f for f in check_recording(recording, robot, entry) if f.wrong or _decides(f)]
         doubts = [f for f in grave if not f.wrong and f.text.startswith("torque")]

@@ -88,6 +88,7 @@ class Columns(NamedTuple):
     drives_named: bool = True  # whether the command's names hold those of joints or drives
     unsigned: str = ""  # a torque beside the command that is left out: an absolute value
     motor: bool = False  # whether the names say that positions are those of motors
+    unused: tuple[str, ...] = ()  # columns that nothing was made of
 
 
 def read_columns(
@@ -96,12 +97,13 @@ def read_columns(
     joints: Sequence[str] | None = None,
     rate: float | None = None,
     drives: Callable[[Sequence[str]], Sequence[Driven]] = lambda joints: (),
+    passive: Sequence[str] = (),
 ) -> list[Columns]:
     """The columns of every recording, in the joints' order of the model; `draft_task` says what may be given.
 
     `tables` are those of `read_tables`, each let go before the next is read.
     """
-    return [_read(table, model, joints, rate, entry, drives) for table, entry in tables]
+    return [_read(table, model, joints, rate, entry, drives, passive) for table, entry in tables]
 
 
 def read_tables(files: Sequence[Path], topic: str | None) -> Iterator[tuple[Table, dict[str, Any]]]:
@@ -138,6 +140,7 @@ def _read(
     rate: float | None,
     entry: dict[str, Any],
     drives: Callable[[Sequence[str]], Sequence[Driven]],
+    passive: Sequence[str],
 ) -> Columns:
     form = entry.get("format")
     if form is None:
@@ -163,15 +166,20 @@ def _read(
         if kind == "command":
             own, source, by_name = _of_driven(table, kinds[kind], names, tuple(known.values()))
         else:
-            own, source, by_name = of_joints(table, kinds[kind], model, list(names), kind)
-            if own != names:
-                raise InputError(f"{table.file}: {kind} is of {', '.join(own)}, position of {', '.join(names)}")
+            few = kind != "velocity" and _count(table, kinds[kind]) < len(names)
+            wanted = [name for name in names if not few or name not in passive]
+            own, source, by_name = of_joints(table, kinds[kind], model, wanted, kind, names)
+            if own != tuple(wanted):
+                raise InputError(f"{table.file}: {kind} is of {', '.join(own)}, position of {', '.join(wanted)}")
         values = _matrix(table, source, own, kind)
+        current = _unit_of_current(source) if kind == "current" else current
+        if kind in ("torque", "current") and len(own) < len(names):
+            values, source = _with_zeros(values, source, own, names)
         if len(values) != len(position):
             raise InputError(f"{table.file}: {kind} has {len(values)} samples, position {len(position)}")
         key = "torque" if kind == "current" else kind
         if key == "torque" and "command" in kinds and without_sign(values):
-            unsigned = source if isinstance(source, str) else ", ".join(source)
+            unsigned = source if isinstance(source, str) else ", ".join(str(name) for name in source if name != 0)
             continue
         if form is None or source != _LOGGED[form].get(key):
             entry[key] = source
@@ -181,13 +189,13 @@ def _read(
             drives_named = by_name
         elif kind != "velocity":
             torque, named = values, named and by_name
-            current = _unit_of_current(source) if kind == "current" else ""
     time, entry = _stamps(table, clock, rate, len(position), entry)
     if form is not None and rate is None:
         del entry["time"]
     motor = bool(_MOTORS & set(words_of(" ".join([sources] if isinstance(sources, str) else sources))))
-    commands = (command, driven, drives_named)
-    return Columns(table.file, entry, names, named, time, position, torque, current, *commands, unsigned, motor)
+    commands, used = (command, driven, drives_named), {clock, *(name for each in kinds.values() for name in each)}
+    unused = tuple(name for name in table.names if name not in used)
+    return Columns(table.file, entry, names, named, time, position, torque, current, *commands, unsigned, motor, unused)
 
 
 _MOTORS = {"motor", "motors", "rotor", "rotors"}
@@ -237,7 +245,8 @@ def _time(table: Table) -> str:
     found = [name for name in names if name.lower() in _TIMES] or [name for name in names if in_halves(name)]
     if not found and "received" in table.names:  # when a bag got a message that has no stamp of its own
         return "received"
-    found = found or [n for n in names if set(words_of(n)) & {*_TIMES} and not set(words_of(n)) & {"des", "cmd"}]
+    told = [n for n in names if set(words_of(n)) & {*_TIMES} and not set(words_of(n)) & {"des", "cmd"}]
+    found = found or [n for n in told if not _falls(table, n)]
     if not found and len(rising := _rising(table)) == 1:
         return rising[0]
     if len(found) != 1:
@@ -256,6 +265,15 @@ def _time(table: Table) -> str:
 
 
 _HALVES = {"secs", "nsec", "nsecs", "nanosec", "nanosecs", "usec", "usecs"}
+
+
+def _falls(table: Table, name: str) -> bool:
+    """Whether a column goes down too often for a clock, even one in which some rows are wrong: `m_t_3` is a torque."""
+    try:
+        steps = np.diff(np.asarray(table.read(name), float))
+    except (InputError, TypeError, ValueError):
+        return False
+    return steps.ndim == 1 and bool(steps.size) and bool((steps < 0).mean() > 1 - _ALIKE)
 
 
 def _rising(table: Table) -> list[str]:
@@ -366,10 +384,35 @@ def _plainest(names: list[str]) -> list[str]:
 _SHADES = {"filt", "filtered", "raw", "smooth", "smoothed", "est", "estimated", "ext", "external", "residual"}
 
 
+def _count(table: Table, columns: list[str]) -> int:
+    """How many columns there are, those of an array counted."""
+    shape = np.shape(table.read(columns[0])) if len(columns) == 1 else ()
+    return shape[1] if len(shape) == 2 else len(columns)
+
+
+def _with_zeros(
+    values: Float[np.ndarray, "samples driven"], source: Any, own: Sequence[str], names: Sequence[str]
+) -> tuple[Float[np.ndarray, "samples joints"], list[str | int]]:
+    """Torques of the driven joints among those of all, and what the task says of them: 0 where nothing drives one."""
+    listed = dict(zip(own, [source] if isinstance(source, str) else source, strict=True))
+    whole = np.zeros((len(values), len(names)))
+    whole[:, [names.index(joint) for joint in own]] = values
+    return whole, [listed.get(joint, 0) for joint in names]
+
+
 def of_joints(
-    table: Table, columns: list[str], model: RobotModel, joints: Sequence[str] | None, kind: str
+    table: Table,
+    columns: list[str],
+    model: RobotModel,
+    joints: Sequence[str] | None,
+    kind: str,
+    moving: Sequence[str] = (),
 ) -> tuple[tuple[str, ...], Any, bool]:
-    """Joints of a kind's columns in the model's order, what the task says of them, and whether names decided it."""
+    """Joints of a kind's columns in the model's order, what the task says of them, and whether names decided it.
+
+    `moving` are the joints whose positions have been read, where there are any: what `joints` holds is then not the
+    user's word, but what is known from them.
+    """
     wanted = list(joints or model.joint_names)
     by_name = {joint: c for joint in wanted for c in columns if holds(c, joint, model.joint_names)}
     if by_name and (joints is None or len(by_name) == len(wanted)):
@@ -395,7 +438,10 @@ def of_joints(
             _refuse_misplaced(table, columns, wanted, model)
             numbered = columns if len(prefixes) > 1 else numbered
         elif len(prefixes) > 1 and len(columns) > 1:
-            raise InputError(f"{table.file}: several sets of columns look like {kind}: {', '.join(columns[:8])}")
+            raise InputError(
+                f"{table.file}: several sets of columns look like {kind}: {', '.join(columns[:8])}; rename those that"
+                f" are not meant (`new` goes by names), or write a task whose `{kind}` names the right ones"
+            )
         count, source = len(columns), numbered
     if joints is None and count != len(model.joint_names):
         raise Undecided(
@@ -405,8 +451,17 @@ def of_joints(
             f"; name the joints of {', '.join(columns[:12])} by --joints, in this order, or give the columns of all"
             f" joints names such as {kind}_{model.joint_names[0]}",
         )
+    if count != len(wanted) and moving and kind in ("torque", "current"):
+        raise Undecided(
+            "passive",
+            f"{table.file}: {count} column{'s'[: count != 1]} of {kind} ({', '.join(columns[:8])}) for"
+            f" {len(wanted)} joint{'s'[: len(wanted) != 1]} ({', '.join(wanted)})",
+            "; name by --passive those that nothing drives, whose torque is zero, and give the columns of the others"
+            f" the names of their joints, such as {kind}_{wanted[0]}",
+        )
     if count != len(wanted):
-        raise InputError(f"{table.file}: {count} columns of {kind}, but --joints names {len(wanted)}")
+        whose = "the positions are of" if moving else "--joints names"
+        raise InputError(f"{table.file}: {count} column{'s'[: count != 1]} of {kind}, but {whose} {len(wanted)}")
     return tuple(wanted), source, False
 
 

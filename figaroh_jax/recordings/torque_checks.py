@@ -86,16 +86,20 @@ def _fit(model: RobotModel, motion: Sampled, nominal: Float[np.ndarray, "rows nv
 
 
 def _heavy(own: Sequence[Likeness], torque: np.ndarray) -> np.ndarray:
-    """Joints that carry something: what the rigid body needs beside friction and rotor is much of their torque."""
-    expected = np.array([one.expected for one in own])
-    return (expected > HEAVY * np.std(torque, axis=0)) & (expected > 0.03 * expected.max())
+    """Joints that carry something: what the rigid body needs beside friction and rotor is much of their torque.
+
+    A torque of one value throughout is of no drive that moves its joint, and says nothing about the columns.
+    """
+    expected, spread = np.array([one.expected for one in own]), np.std(torque, axis=0)
+    return (expected > HEAVY * spread) & (expected > 0.03 * expected.max()) & (spread > 0)
 
 
 def _weightless(model: RobotModel, motion: Sampled) -> np.ndarray:
     """Joints without gravity in their torque; none unless most of those that should have it lack it."""
     assert motion.torque is not None
     slope, error, expected = share_of_gravity(model, motion)
-    asked = (expected > HEAVY * np.std(motion.torque, axis=0)) & (expected > 0.05 * expected.max())
+    spread = np.std(motion.torque, axis=0)
+    asked = (expected > HEAVY * spread) & (expected > 0.05 * expected.max()) & (spread > 0)
     lacks = asked & (slope + 3 * error < 0.3) & (slope > -0.3)
     return lacks if lacks.sum() > 0.5 * asked.sum() else np.zeros(len(lacks), bool)
 
