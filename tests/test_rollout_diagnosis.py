@@ -178,6 +178,12 @@ def test_lost_and_late_rows_are_filled_in_and_count_for_nothing():
     gone = run._replace(time=run.time + 0.08 * (np.arange(399) >= 200))
     assert without_gaps(gone) == (gone, "")
     assert without_gaps(run._replace(time=0.01 * np.arange(399)))[1] == ""
+    queue = run._replace(time=0.01 * np.arange(399) + 0.008 * (np.arange(399) < 1) + 0.004 * (np.arange(399) < 2))
+    begun, said = without_gaps(queue)  # the first stamps: 12, 14 and 20 ms
+    assert "the stamps before row 1 (from 0) are closer together" in said
+    np.testing.assert_array_equal(begun.time, queue.time[1:])
+    np.testing.assert_array_equal(begun.position, queue.position[1:])
+    assert regular("run", begun.time) == pytest.approx(0.01, rel=2e-3)
 
 
 def test_a_recording_with_lost_rows_is_diagnosed_and_predicted_at_its_own_stamps(tmp_path: Path):

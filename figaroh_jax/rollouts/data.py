@@ -29,6 +29,7 @@ __all__ = [
 ]
 
 _GAP, _GAPS = 3.0, 0.01  # periods from a row to the next, and share of rows, up to which gaps are filled in
+_BEGINNING = 0.02  # share of rows within which a clock may have to settle
 _LEAD = 0.2  # s of command kept before a window: no delay is longer
 _KEPT = 0.97334  # variance of a normal variable that never leaves three sigma
 _SMOOTH = 0.99  # level of the squares left by a cubic, up to which it follows the rows
@@ -76,13 +77,15 @@ def without_gaps(run: Run) -> tuple[Run, str]:
     """A recording of which a few rows are lost or late, with rows that count for nothing in the gaps, and what is said.
 
     The command holds through a gap, and the clock is that of the other rows: it is off by half a period at most for
-    each. What is not a few short gaps is left as it is, for `regular` to refuse.
+    each. First rows whose stamps are closer together than those after them, as a logger empties a queue, are left out.
+    What is neither that nor a few short gaps is left as it is, for `regular` to refuse.
     """
+    run, begun = _settled(run)
     steps = np.diff(run.time)
     period = float(np.median(steps))
     late = np.abs(steps - period) > 0.5 * period
     if not late.any() or late.mean() > _GAPS or steps.max() > _GAP * period or steps.min() <= 0.5 * period:
-        return run, ""
+        return run, begun
     period = float(steps[~late].mean())
     row = np.concatenate([[0], np.cumsum(np.round(steps / period).astype(int))])
     every = np.arange(row[-1] + 1)
@@ -100,10 +103,27 @@ def without_gaps(run: Run) -> tuple[Run, str]:
         filled=filled,
     )
     first, most = int(late.argmax()) + 1, 1e3 * (steps.max() - period)
-    return new, (
+    return new, (f"{begun}; " if begun else "") + (
         f"{run.name}: rows that come late: {late.sum()} of {len(run.time)}, the first row {first} (from 0), by at most"
         f" {most:.3g} ms; the command is taken to hold, and rows that count for nothing are filled in: {filled.sum()}"
     )
+
+
+def _settled(run: Run) -> tuple[Run, str]:
+    """The recording from the row on at which its clock has settled, and what is said of the rows before it."""
+    steps = np.diff(run.time)
+    early = np.flatnonzero(steps < 0.5 * np.median(steps)) + 1
+    if not len(early) or early[-1] > _BEGINNING * len(run.time) or run.carried is not None:
+        return run, ""
+    first = int(early[-1])
+    held = {key: None if (x := getattr(run, key)) is None else x[first:] for key in _BY_ROW}
+    return run._replace(**held), (
+        f"{run.name}: the stamps before row {first} (from 0) are closer together than the others: these rows are left"
+        " out"
+    )
+
+
+_BY_ROW = ("time", "command", "position", "velocity", "trusted")
 
 
 def _through(row: np.ndarray, every: np.ndarray, values: np.ndarray) -> np.ndarray:
