@@ -69,6 +69,7 @@ class Hidden(NamedTuple):
     recordings: tuple[Recording, ...]
     rows: tuple[int, ...] = ()  # of outliers
     order: float = 0.0  # of a gear error
+    built: np.ndarray | None = None  # (joints, 6): how far each link is off, m and rad
 
 
 class _Error(NamedTuple):
@@ -128,7 +129,7 @@ def hide(
     parts = [loaded == value for value in (False, True) if np.any(loaded == value)]
     unknown = tuple(name for name in ("base_frame", "tool_frame") if name != effect)
     recordings = tuple(Recording(time[p], q[p], seen[p], bool(loaded[p][0])) for p in parts)
-    return Hidden(effect or "nothing", right, unknown, recordings, rows, error.order)
+    return Hidden(effect or "nothing", right, unknown, recordings, rows, error.order, built)
 
 
 class Perturbed(NamedTuple):
