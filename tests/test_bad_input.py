@@ -16,8 +16,8 @@ from tasks import URDF, arrays, task, write
 
 import figaroh_jax as fj
 from figaroh_jax.cli import main
-from figaroh_jax.diagnosis.diagnosis import _refuse_unmeasured
 from figaroh_jax.errors import InputError
+from figaroh_jax.recordings.checks import refuse_unmeasured
 
 Spoil = Callable[[Path], Any]  # takes the folder of a right task and makes it wrong
 
@@ -343,6 +343,6 @@ def test_a_joint_that_rests_in_one_recording_is_no_reason_to_refuse_the_others()
     q, tau = np.random.default_rng(0).standard_normal((2, 50, 4))
     moved = [fj.recording(q=q, tau=tau, rate=100) for _ in range(2)]
     dead = [dataclasses.replace(one, torque=tau * [1, 1, 1, 0] + 0.3) for one in moved]
-    _refuse_unmeasured(robot, [dead[0], moved[1]])
+    refuse_unmeasured(robot, [dead[0], moved[1]])
     with pytest.raises(InputError, match=r"torque of wrist is 0\.3 in every row"):
-        _refuse_unmeasured(robot, dead)
+        refuse_unmeasured(robot, dead)

@@ -64,7 +64,13 @@ def test_columns_of_links_stand_at_the_joints_of_the_recording(
     np.testing.assert_allclose(dense @ theta, expected, rtol=0, atol=1e-11 * size)
 
 
-@pytest.mark.parametrize("order", [["elbow", "shoulder", "waist", "wrist"], ["wrist", "elbow", "shoulder", "waist"]])
+@pytest.mark.parametrize(
+    "order",
+    [
+        ["elbow", "shoulder", "waist", "wrist"],
+        pytest.param(["wrist", "elbow", "shoulder", "waist"], marks=pytest.mark.slow),
+    ],
+)
 def test_what_is_missing_does_not_depend_on_the_order_of_columns(order: list[str], tmp_path: Path) -> None:
     """The demo by the command line, its columns as they are (in the order of the tree), by name and from the end."""
     task = yaml.safe_load((DEMO / "task.yaml").read_text())

@@ -84,6 +84,7 @@ def about_joint(k: int) -> float:
     return MASS[k] * COM[k] ** 2
 
 
+@pytest.mark.slow
 def test_an_inertia_that_a_file_states_about_the_joint_is_found_and_told(tmp_path: Path):
     twice = tuple(INERTIA[k] + about_joint(k) for k in (0, 1))
     runs = [swung(pendulum(), k) for k in range(4)]
@@ -103,6 +104,7 @@ def test_an_inertia_that_a_file_states_about_the_joint_is_found_and_told(tmp_pat
     assert clean.verdict == "nothing"
 
 
+@pytest.mark.slow
 def test_a_link_that_is_drawn_is_found_and_a_detent_is_none(tmp_path: Path):
     """Of the upper link a payload and a rotor tell as much: it turns about nothing that moves."""
     rng = np.random.default_rng()

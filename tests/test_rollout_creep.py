@@ -107,7 +107,7 @@ def test_friction_that_creeps_as_the_files_is_nothing(tmp_path: Path) -> None:
     assert (found.verdict, found.named, found.creeps) == ("nothing", [], [])
 
 
-@pytest.mark.parametrize("detent", [0.1, 0.3])
+@pytest.mark.parametrize("detent", [0.1, pytest.param(0.3, marks=pytest.mark.slow)])
 def test_what_is_not_in_the_catalogue_is_no_friction_that_holds(tmp_path: Path, detent: float) -> None:
     """A robot whose friction creeps as the file's, with a torque of its own beside it."""
     _, found = diagnosed(tmp_path, servo(), servo(friction=0.3, damping=0.2), detent)

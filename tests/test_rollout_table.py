@@ -90,6 +90,7 @@ def test_no_table_where_there_is_none_however_wrong_the_model(small: Loop):
     assert [on_table(change(small), runs) for change in changes] == [None] * len(changes)
 
 
+@pytest.mark.slow
 def test_a_recording_whose_only_fault_is_the_table_says_contact_and_nothing_else(small: Loop):
     """One recording, two seconds on a plane, friction in the model: no name, no second contact where none is."""
     run, touches = record(-0.1365, 0)
