@@ -132,7 +132,7 @@ def test_an_effect_beside_a_geometry_that_is_right_is_named(folder: Path):
     """The links stand exactly where the file says: frames alone are the level, and what is beside them stays."""
     bench, rng = study(), np.random.default_rng()
     arm, grades = bench.arm("arm6", folder), []
-    for _ in range(4):  # of 256 drawn ones 240 are right: two of four may be silent, none may be wrong
+    for _ in range(3):  # of 256 drawn ones 240 are right: one of three may be silent, none may be wrong
         case = postures.hide(arm, "gear_transmission_error", 10.0, rng, off=0.0)
         found = bench.diagnose(arm, case)
         grades.append((bench.grade(case, found), found.verdict))
@@ -258,6 +258,11 @@ def test_an_offset_of_a_robot_whose_links_are_all_off_is_not_called_a_link(
     case = postures.hide(arm, "joint_offset", 20.0, np.random.default_rng(seed), count=40, off=4.0)
     found = study().diagnose(arm, case)
     assert found.verdict in ("named+rest", "unknown"), (seed, found.verdict)
+    told_true = kept in (None, 1674464884)
+    assert told_true or study().grade(case, found).rstrip("+") in ("right", "set", "unknown"), (
+        case.right,
+        found.causes,
+    )
     for cause in found.causes:
         if cause.name not in case.right and not case.right & {*cause.ambiguous_with}:
             assert cause.name.effect == "link_geometry" and case.built is not None, (seed, case.right, found.causes)
@@ -267,6 +272,8 @@ def test_an_offset_of_a_robot_whose_links_are_all_off_is_not_called_a_link(
             for key, told in cause.parameters.items():  # within what the links beside it may have of it, a tolerance
                 near = 4.0 * told.std + postures.TOLERANCE[told.unit]
                 assert abs(told.value - link[key]) < near, (seed, cause, link)
+            most = max(abs(link[key]) / postures.TOLERANCE[told.unit] for key, told in cause.parameters.items())
+            assert most > 4.0, (seed, cause, link)  # more than all links are in the mean square
     assert len(found.causes) <= 2, (seed, found.causes)  # one link may indeed be far off for its robot
     assert any("geometry is off beyond its tolerance" in note for note in found.calibration.notes), seed
     assert found.causes or found.rest.nearest, seed
