@@ -26,7 +26,7 @@ from figaroh_jax.reporting.wording import sentence
     ("seed", "strange"),
     [
         (5021, False),  # a link's inertia: noise of 10 % in the band of a slow motion, 4096 counts
-        (21003, False),  # a ripple: 4 s of slow noise
+        pytest.param(21003, False, marks=pytest.mark.slow),  # a ripple: 4 s of slow noise
         (21057, False),  # unknown: friction turns between samples 20 ms apart
         (1007, True),  # unknown: 60 Hz with stamps in whole milliseconds
         pytest.param(

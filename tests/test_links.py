@@ -146,7 +146,9 @@ REAL = {  # what is known of the sets from elsewhere: see the README of each and
 }
 
 
-@pytest.mark.parametrize("name", ["panda", "tx40", pytest.param("dfki_double_pendulum", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["tx40", *(pytest.param(name, marks=pytest.mark.slow) for name in ("panda", "dfki_double_pendulum"))]
+)
 def test_what_is_wrong_with_the_links_of_real_robots_files_is_told(name: str, data_dir: Path, tmp_path: Path) -> None:
     """The Panda's file has a hand that was not mounted, the pendulum's its inertias about the joints, as the set's own
     yml has them; the TX40's has no rotors."""

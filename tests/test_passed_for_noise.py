@@ -59,7 +59,11 @@ def test_the_noise_beside_a_large_ripple_is_that_of_its_sensor(seed: int):
 
 @needs_robots
 @pytest.mark.parametrize(
-    "effect, at", [("asymmetric_viscous_friction", ("joint_2",)), ("friction_drift", ("joint_6",))]
+    "effect, at",
+    [
+        ("asymmetric_viscous_friction", ("joint_2",)),
+        pytest.param("friction_drift", ("joint_6",), marks=pytest.mark.slow),
+    ],
 )
 def test_what_the_catalogue_lacks_is_not_told_as_noise(effect: str, at: tuple[str, ...]):
     """27 s without repeats: six and four times the sensor's noise had been told there, and `nothing`."""

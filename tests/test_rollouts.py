@@ -141,10 +141,18 @@ HAND = """<mujoco><compiler angle="radian"/><option timestep="0.004" integrator=
 <inertial pos=".05 .03 .02" mass=".2" diaginertia=".002 .003 .003"/></body></body></body></worldbody>
 <tendon><fixed name="grip"><joint joint="thumb" coef="1"/><joint joint="finger" coef="-.7"/></fixed></tendon><actuator>
 <position name="close" tendon="grip" kp="9" kv=".9"/><position name="thumb" joint="thumb" kp="30" kv="1.5"/></actuator></mujoco>"""
+FREE = '<joint type="free" armature=".2" damping=".1"/>'
 
 
-@pytest.mark.parametrize("integrator", ["implicitfast", "RK4"])
-@pytest.mark.parametrize("root", ["", '<joint type="free" armature=".2" damping=".1"/>'])
+@pytest.mark.parametrize(
+    "root, integrator",
+    [
+        ("", "implicitfast"),
+        (FREE, "RK4"),
+        pytest.param("", "RK4", marks=pytest.mark.slow),
+        pytest.param(FREE, "implicitfast", marks=pytest.mark.slow),
+    ],
+)
 def test_a_hand_is_mujocos(tmp_path: Path, root: str, integrator: str):
     """A drive of fingers on two branches, one at the end of its torque range, beside a ball and a free base."""
     path = written(tmp_path, HAND.replace("{root}", root).replace("{integrator}", integrator))

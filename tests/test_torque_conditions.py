@@ -36,8 +36,8 @@ from figaroh_jax.recordings.signals import prepare_all
         pytest.param(94, "nothing", id="moves with rests, without a filter", marks=pytest.mark.slow),
         pytest.param(104, "nothing", id="stamps that shake, a recording kept out"),
         pytest.param(73, "nothing", id="an offset of the baseline, and a difference that takes it off"),
-        pytest.param(70, "right", id="a coupling behind columns in another order"),
-        pytest.param(33, "right", id="an offset of a joint that rests"),
+        pytest.param(70, "right", id="a coupling behind columns in another order", marks=pytest.mark.slow),
+        pytest.param(33, "right", id="an offset of a joint that rests", marks=pytest.mark.slow),
     ],
 )
 def test_a_strangers_recording_gets_its_cause(seed: int, mark: str) -> None:
@@ -50,7 +50,9 @@ def test_a_strangers_recording_gets_its_cause(seed: int, mark: str) -> None:
 @pytest.mark.parametrize(
     ("seed", "effects", "mark"),
     [
-        pytest.param(7073, [], "nothing", id="steps of an encoder that a gear's resonance filters out"),
+        pytest.param(
+            7073, [], "nothing", id="steps of an encoder that a gear's resonance filters out", marks=pytest.mark.slow
+        ),
         pytest.param(
             31000,
             [],
