@@ -32,8 +32,9 @@ from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.bodies import searched_with_bodies
 from figaroh_jax.rollouts.creep import searched_with_both
 from figaroh_jax.rollouts.data import Run, Stretch
+from figaroh_jax.rollouts.found import Named
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import Named, search
+from figaroh_jax.rollouts.search import search
 from figaroh_jax.rollouts.setting import setting
 
 

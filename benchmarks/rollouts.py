@@ -32,10 +32,11 @@ from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.data import Run, Stretch, windows
 from figaroh_jax.rollouts.faults import faults
 from figaroh_jax.rollouts.fit import fit, start_of
+from figaroh_jax.rollouts.found import Search
 from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.parameters import Entry, put, values
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import Search, search
+from figaroh_jax.rollouts.search import search
 from figaroh_jax.rollouts.sensitivity import linear_sums
 from figaroh_jax.rollouts.setting import Setting, setting
 from figaroh_jax.rollouts.table import on_table

@@ -24,8 +24,9 @@ from generators import servo_arm
 from figaroh_jax.rollouts.creep import searched_with_both
 from figaroh_jax.rollouts.data import Run
 from figaroh_jax.rollouts.fit import standard_errors
+from figaroh_jax.rollouts.found import Search
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import Search, search
+from figaroh_jax.rollouts.search import search
 from figaroh_jax.rollouts.setting import setting
 
 TRUTH = {"armature": 0.05, "damping": 0.4, "friction": 0.3}

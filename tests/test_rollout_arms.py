@@ -20,10 +20,10 @@ from figaroh_jax.rollouts.faults import faults, without
 from figaroh_jax.rollouts.fit import System, _freedom, fit, spread_of_recordings, standard_errors  # pyright: ignore[reportPrivateUsage]
 from figaroh_jax.rollouts.parameters import Entry, values
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import t_of, t_of_places
 from figaroh_jax.rollouts.sensitivity import Sums, Windows, predicted
 from figaroh_jax.rollouts.setting import Structure, begun, evened, setting
 from figaroh_jax.rollouts.simulation import rollout
+from figaroh_jax.rollouts.thresholds import t_of, t_of_places
 
 ROWS = 400
 

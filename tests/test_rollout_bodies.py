@@ -21,10 +21,10 @@ from figaroh_jax.rollouts.bodies import Link, body_notes, nearest_bodies, search
 from figaroh_jax.rollouts.causes import elastic_loop, elastic_table
 from figaroh_jax.rollouts.data import Run, Stretch
 from figaroh_jax.rollouts.fit import fit
+from figaroh_jax.rollouts.found import Model, Search
 from figaroh_jax.rollouts.loop import brought_back
 from figaroh_jax.rollouts.parameters import Entry, put, values
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import Model, Search
 from figaroh_jax.rollouts.setting import Setting, Structure, setting
 from figaroh_jax.rollouts.task import simulated
 

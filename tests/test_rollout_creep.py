@@ -16,10 +16,11 @@ from figaroh_jax.rollouts.causes import catalogue, elastic_loop
 from figaroh_jax.rollouts.creep import creep_notes, creep_speed, searched_with_both, stiff
 from figaroh_jax.rollouts.data import Run
 from figaroh_jax.rollouts.export import described, for_simulator, with_drives
+from figaroh_jax.rollouts.found import Named, Search
 from figaroh_jax.rollouts.loop import STIFFEST
 from figaroh_jax.rollouts.parameters import values
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import Named, Search, search
+from figaroh_jax.rollouts.search import search
 from figaroh_jax.rollouts.setting import Setting, Structure, setting
 from figaroh_jax.rollouts.task import simulated
 

@@ -11,10 +11,11 @@ import pytest
 from figaroh_jax.results import Name
 from figaroh_jax.rollouts.causes import Candidate
 from figaroh_jax.rollouts.data import Run
+from figaroh_jax.rollouts.found import Named
 from figaroh_jax.rollouts.loop import Loop
 from figaroh_jax.rollouts.parameters import put
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import Named, leading, search
+from figaroh_jax.rollouts.search import leading, search
 from figaroh_jax.rollouts.setting import setting
 from figaroh_jax.rollouts.task import proxies, simulated
 

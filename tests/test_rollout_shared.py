@@ -12,10 +12,10 @@ from generators import servo_arm6
 
 from figaroh_jax.rollouts.arm import as_sure_together, search_arm
 from figaroh_jax.rollouts.data import Run, Stretch
+from figaroh_jax.rollouts.found import Named, all_but
 from figaroh_jax.rollouts.gates import standing
 from figaroh_jax.rollouts.parameters import of_one_number, put, values
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import Named, all_but
 from figaroh_jax.rollouts.setting import Setting, Structure, begun, setting
 from figaroh_jax.rollouts.shared import as_one_number, of_one_kind
 from figaroh_jax.rollouts.thresholds import T_BESIDE_REST

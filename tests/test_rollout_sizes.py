@@ -14,9 +14,10 @@ from scipy import stats
 from figaroh_jax.reporting import wording
 from figaroh_jax.results import BoundedEstimate, Estimate, Name
 from figaroh_jax.rollouts.data import Run
+from figaroh_jax.rollouts.found import Search
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.rest import nearest_of
-from figaroh_jax.rollouts.search import Search, search
+from figaroh_jax.rollouts.search import search
 from figaroh_jax.rollouts.setting import setting
 from figaroh_jax.rollouts.sizes import is_open, least_sure
 

@@ -12,8 +12,8 @@ from generators import servo_arm6
 
 from figaroh_jax.rollouts.arm import search_arm
 from figaroh_jax.rollouts.data import Run, Stretch
+from figaroh_jax.rollouts.found import Search
 from figaroh_jax.rollouts.reading import load_loop
-from figaroh_jax.rollouts.search import Search
 from figaroh_jax.rollouts.setting import setting
 from figaroh_jax.rollouts.steady import Normal
 

@@ -15,11 +15,11 @@ import numpy as np
 from ..results import Name
 from .causes import Candidate
 from .fit import Fit, System, fit
+from .found import Named
 from .parameters import values
 from .screening import LATE, ROUGH, Standing, excess_of, joint_of, outputs
-from .search import Named, t_of
 from .setting import Setting, free_entries, start_values
-from .thresholds import NO_CHOICE, STILL_NEEDED, UNTOLD
+from .thresholds import NO_CHOICE, STILL_NEEDED, UNTOLD, t_of
 
 __all__ = ["Instead", "instead", "names", "rivals"]
 

@@ -20,10 +20,11 @@ from .alike import instead, names, rivals
 from .causes import Candidate
 from .faults import Fault, faults, without
 from .fit import Fit, fit, spread_of_recordings
+from .found import TOO_LITTLE, Model, Named, Search, Tried, all_but
 from .gates import Slight, checked, gained, in_order, needless, replaced, rms_of, standing, still_needed, worthy
 from .parameters import put, values
 from .screening import LATE, ROUGH, Known, Standing, excess_of, joint_of, joint_of_entry, outputs, sprung_now, tried_now
-from .search import TOO_LITTLE, Model, Named, Search, Tried, all_but, judged_by_colour, sized, t_of, why_not_sized
+from .search import in_short_windows, judged_by_colour, quiet
 from .sensitivity import predicted
 from .setting import (
     Setting,
@@ -34,17 +35,15 @@ from .setting import (
     by_readings,
     by_recording,
     evened,
-    far_off,
     free_entries,
-    in_parts,
     level_of,
     thinned,
 )
 from .shared import at_all_joints, t_together
-from .sizes import fitted_without, simpler
+from .sizes import fitted_without, simpler, sized, why_not_sized
 from .steady import in_doubt
 from .table import on_table
-from .thresholds import FEWEST_JOINTS, NEAR, NO_CHOICE, T_BESIDE_REST, UNTOLD
+from .thresholds import FEWEST_JOINTS, NEAR, NO_CHOICE, T_BESIDE_REST, UNTOLD, t_of
 
 __all__ = ["alike_by_recording", "as_sure_together", "baseline_alone", "search_arm"]
 
@@ -72,22 +71,18 @@ def _by_parts(here: Setting, found: Search, progress: Callable[[str, float], Non
     What a long simulation has lost sight of, as where a drive's limit lets a joint fall, shows no cause.
     """
     here, origin = found.setting or here, found.origin
-    if found.verdict != "unknown" or origin is None or not np.isfinite(found.last.cost):
+    if origin is None:
         return found
-    if not far_off(here, found.first) or len(in_parts(here).stretches) == len(here.stretches):
+    verdicts = ("nothing", "named")
+    seen = in_short_windows(here, found, progress, lambda parts: _searched(parts, quiet, forbid), verdicts)
+    if seen is None:
         return found
-    progress("searching for causes in short windows", 0.9)
-    short = _searched(in_parts(here), lambda phase, share: None, forbid)
-    if short.verdict not in ("nothing", "named"):
-        return found
-    free = [int(k) for k in short.last.free if k >= 0]
-    structure = short.structure._replace(data=here.cut(short.structure.loop))
-    one = fit(*structure, short.last.theta[None], [free], width=max(here.width, len(free)), lanes=1)[0]
-    now = standing(here, structure, one, free)
+    free = [int(k) for k in seen.last.free if k >= 0]
+    now = standing(here, seen.structure, seen.last, free)
     if not now.excess.max() < 1.0:
         return found
     begin = standing(here, origin, found.first, here.baseline)
-    return _ended(here, found, short.named, now, begin)
+    return _ended(here, found, seen.short.named, now, begin)
 
 
 def _ended(here: Setting, search: Search, found: list[Named], now: Standing, begin: Standing) -> Search:

@@ -23,11 +23,11 @@ from ..results import Name
 from .arm import baseline_alone
 from .causes import Candidate
 from .fit import Fit, System, fit
+from .found import TOO_LITTLE, Model, Named, Search
 from .gates import rms_of, standing
 from .loop import Loop, brought_back
 from .parameters import TEN, Entry, put, values
 from .screening import Standing, excess_of
-from .search import TOO_LITTLE, Model, Named, Search, t_of, t_of_recordings
 from .sensitivity import Windows
 from .setting import Setting, Structure, by_recording, excess, free_entries, thinned, whitened
 from .sizes import told_errors
@@ -41,6 +41,8 @@ from .thresholds import (
     STEADY_OF_A_LINK,
     T_BESIDE_REST,
     T_WITHOUT_REST,
+    t_of,
+    t_of_recordings,
 )
 
 __all__ = [

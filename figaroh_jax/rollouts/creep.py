@@ -21,14 +21,14 @@ from ..results import Name
 from .arm import baseline_alone
 from .causes import Candidate, catalogue
 from .fit import Fit, fit
+from .found import Named, Search
 from .gates import rms_of, standing
 from .loop import STIFFEST, Loop, mobility, turns
 from .parameters import put
 from .screening import LATE, ROUGH, Standing, excess_of, joint_of
-from .search import Named, Search, t_of, t_of_recordings
 from .setting import Setting, Structure, by_recording, largest_forces, thinned
 from .shared import t_together
-from .thresholds import CONFIDENT, GAIN, GAIN_BESIDE_REST, HOPEFUL, T_BESIDE_REST
+from .thresholds import CONFIDENT, GAIN, GAIN_BESIDE_REST, HOPEFUL, T_BESIDE_REST, t_of, t_of_recordings
 
 __all__ = ["REMARK", "creep_notes", "creep_speed", "fitted_with_both", "searched_with_both", "stiff"]
 

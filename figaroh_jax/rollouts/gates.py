@@ -8,11 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from .fit import Fit, System, fit, refitted_without
+from .found import Model, Named, Tried, all_but
 from .loop import alike
 from .parameters import values
 from .screening import LATE, ROUGH, Standing, excess_of, joint_of, outputs
-from .search import Model, Named, Tried, all_but, sized, t_of, t_of_places, t_of_recordings
 from .setting import Setting, Structure, by_recording, counted
+from .sizes import sized
 from .thresholds import (
     CONFIDENT,
     COST_OF_A_MISSED,
@@ -28,6 +29,9 @@ from .thresholds import (
     T_WITHOUT_REST,
     UNTOLD,
     USUAL,
+    t_of,
+    t_of_places,
+    t_of_recordings,
 )
 
 __all__ = [

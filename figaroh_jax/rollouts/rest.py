@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.signal import periodogram
 
 from ..results import Dependence, Nearest, Part, Trace
-from .search import Search
+from .found import Search
 
 __all__ = ["nearest_of", "parts_of", "relative_rest"]
 

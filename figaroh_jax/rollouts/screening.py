@@ -15,10 +15,11 @@ import numpy as np
 
 from .causes import Candidate, elastic_loop, elastic_table, springs
 from .fit import Fit, fit
+from .found import Model, Tried
 from .loop import Loop
 from .own import is_own
 from .parameters import OF_DRIVES, OF_SEVERAL, values
-from .search import Model, Tried, scored, settled
+from .search import scored, settled
 from .sensitivity import Windows
 from .setting import (  # fmt: skip
     Setting,

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import gammainccinv, ndtr
+from scipy.special import ndtr
 
 from ..results import Name, Verdict
 from .causes import Candidate, elastic_loop, elastic_table, springs
 from .colour import colour_of
-from .faults import Fault
-from .fit import Fit, System, fit, held_out, refitted_without, spread_of_recordings, standard_errors
+from .fit import Fit, System, fit, held_out, refitted_without, spread_of_recordings
+from .found import TOO_LITTLE, Model, Named, Search, Tried
 from .parameters import values
 from .setting import (
     Setting,
@@ -36,46 +36,34 @@ from .setting import (
     start_values,
     whitened,
 )
-from .sizes import fitted_without, simpler
-from .starting import shown, suggested
+from .sizes import fitted_without, simpler, sized, why_not_sized
+from .starting import suggested
 from .steady import in_doubt
 from .thresholds import (
-    CLEAR_OF_NOTHING,
     CONFIDENT,
     GAIN,
     GAIN_BESIDE_REST,
-    LEAST_OF_A_RECORDING,
     NEAR,
     NO_WORSE,
-    OF_ITS_SIZE,
     SLIGHT,
     SURE_OF_NOISE,
     T_BESIDE_REST,
     T_WITHOUT_REST,
     UNTOLD,
     USUAL,
+    t_of,
 )
 
 __all__ = [
-    "Model",
-    "Named",
-    "Search",
-    "Tried",
-    "all_but",
+    "in_short_windows",
     "judged_by_colour",
     "leading",
+    "quiet",
     "scored",
     "search",
     "settled",
-    "TOO_LITTLE",
-    "sized",
-    "t_of",
-    "t_of_places",
-    "t_of_recordings",
-    "why_not_sized",
 ]
 
-TOO_LITTLE = "improves held-out data too little"
 _SHORT = 6  # candidates that are fitted where a linear screening can order them
 _CHECKED = 3  # candidates whose held-out squares are those of fits without some recordings
 _ROOM = 120  # columns beside what is free that one linearisation takes: each is a fiftieth of the first
@@ -84,46 +72,6 @@ _OUT_OF_SIGHT = 4.0  # times the squares of a fit, beyond which those of rows le
 _SHORTER = 4  # of one joint of an arm
 _MOST, _MOST_ONE = 6, 4  # causes, and where only a rest that is noise gives them a name
 _EARLY, _LATE = 4, 30  # iterations of a race among all starts, and of its leaders
-
-
-class Named(NamedTuple):
-    """A cause that was found."""
-
-    candidate: Candidate
-    t: float
-    gain: float
-    alike: tuple[Name, ...]
-    before: float = float("nan")  # held-out RMS, rad or m
-    after: float = float("nan")
-
-
-def all_but(found: Sequence[Named], gone: Candidate) -> list[Named]:
-    """The causes but one, and but those that have its numbers: joints of one kind of drive have one together."""
-    return [n for n in found if (n.candidate.effect, n.candidate.entries) != (gone.effect, gone.entries)]
-
-
-@dataclass
-class Search:
-    """What was found."""
-
-    verdict: Verdict
-    named: list[Named]
-    structure: Structure
-    first: Fit  # baseline
-    last: Fit
-    p_value: float
-    proxy: list[Named] = field(default_factory=list)  # best, not named
-    nearest: list[tuple[Name, float, str]] = field(default_factory=list)
-    table: list[tuple[str, float]] = field(default_factory=list)  # chi2/N after each step
-    held: list[float] = field(default_factory=list)  # held-out RMS of the baseline and after each cause, rad or m
-    fits: list[Fit] = field(default_factory=list)  # after each cause
-    origin: Structure | None = None  # of the baseline
-    setting: Setting | None = None  # where rows were left out: without them
-    faults: list[Fault] = field(default_factory=list)  # why they were
-    spread: np.ndarray | None = None  # (columns of `last`,) by recordings: half of each 95 % interval over 1.96
-    doubtful: list[tuple[Name, float, str]] = field(default_factory=list)  # of no sure size, left out, with their gain
-    creeps: list[Named] = field(default_factory=list)  # friction that holds where the file's creeps
-    beside: Fit | None = None  # where a cause that is too slight to be named is left out: with it noise alone is left
 
 
 def judged_by_colour(here: Setting, found: Search, seek: Callable[[Setting], Search]) -> Search:
@@ -153,15 +101,6 @@ def judged_by_colour(here: Setting, found: Search, seek: Callable[[Setting], Sea
     return new
 
 
-class Model(NamedTuple):
-    """The model that stands, and the causes in it."""
-
-    structure: Structure
-    fit: Fit
-    free: tuple[int, ...]
-    excess: float
-
-
 def search(
     here: Setting,
     progress: Callable[[str, float], None] = lambda phase, share: None,
@@ -178,24 +117,51 @@ def search(
 
 def _by_parts(here: Setting, found: Search, progress: Callable[[str, float], None], forbid: Sequence[str]) -> Search:
     """A search; where it has ended far from noise, one in short windows, if it leaves noise alone in whole ones too."""
-    lost = found.verdict == "unknown" and np.isfinite(found.last.cost) and far_off(here, found.first)
-    if not lost or len(in_parts(here).stretches) == len(here.stretches):
+    seen = in_short_windows(here, found, progress, lambda parts: _searched(parts, quiet, forbid), ("named",))
+    if seen is None or excess(whitened(seen.structure, seen.last), np.asarray(seen.structure.data.share)) >= 1.0:
         return found
-    progress("searching for causes in short windows", 0.9)
-    short = _searched(in_parts(here), lambda phase, share: None, forbid)
-    if short.verdict != "named":
-        return found
-    structure = short.structure._replace(data=here.cut(short.structure.loop))
-    free = [int(k) for k in short.last.free if k >= 0]
-    last = fit(*structure, short.last.theta[None], [free], width=max(here.width, len(free)), lanes=1)[0]
-    if not np.isfinite(last.cost) or excess(whitened(structure, last), np.asarray(structure.data.share)) >= 1.0:
-        return found
+    short, structure, last = seen
     held = [found.held[0], _rms(here, held_out(last, here.folds))]
     named = [one._replace(before=held[0], after=held[1]) for one in short.named]
     label = ", ".join(str(Name(one.candidate.effect, one.candidate.at)) for one in named)
     levels = [found.table[0], (label, level_of(last, structure.data))]
     more = {"first": found.first, "last": last, "p_value": found.p_value, "origin": found.origin, "fits": [last]}
     return replace(short, structure=structure, named=named, table=levels, held=held, setting=None, **more)
+
+
+class Seen(NamedTuple):
+    """What a search in short windows has found, and the fit of it over whole ones."""
+
+    short: Search
+    structure: Structure
+    last: Fit
+
+
+def in_short_windows(
+    here: Setting,
+    found: Search,
+    progress: Callable[[str, float], None],
+    seek: Callable[[Setting], Search],
+    verdicts: Sequence[Verdict],
+) -> Seen | None:
+    """What `seek` finds in short windows where a search has ended far from noise; none where it ends otherwise."""
+    if found.verdict != "unknown" or not np.isfinite(found.last.cost) or not far_off(here, found.first):
+        return None
+    parts = in_parts(here)
+    if len(parts.stretches) == len(here.stretches):
+        return None
+    progress("searching for causes in short windows", 0.9)
+    short = seek(parts)
+    if short.verdict not in verdicts:
+        return None
+    structure = short.structure._replace(data=here.cut(short.structure.loop))
+    free = [int(k) for k in short.last.free if k >= 0]
+    last = fit(*structure, short.last.theta[None], [free], width=max(here.width, len(free)), lanes=1)[0]
+    return Seen(short, structure, last) if np.isfinite(last.cost) else None
+
+
+def quiet(phase: str, share: float) -> None:
+    """Progress of which nothing is told."""
 
 
 def _searched(
@@ -269,15 +235,6 @@ def _spread(here: Setting, now: Model) -> np.ndarray | None:
     if now.excess < 1.0 or not by_recording(here):
         return None
     return spread_of_recordings(now.structure.table, now.fit, here.folds)
-
-
-class Tried(NamedTuple):
-    """A candidate that was fitted."""
-
-    candidate: Candidate
-    state: Model
-    sse: np.ndarray  # held out, by blocks and windows; of an arm those of its fit, by joints too
-    alone: bool = True  # no other joint had a candidate in the same fit
 
 
 def _tried(here: Setting, now: Model, named: Sequence[Candidate], forbid: Sequence[str]) -> list[Tried]:
@@ -480,34 +437,6 @@ def _elastic(here: Setting, now: Model, forbid: Sequence[str]) -> list[Tried]:
     return found
 
 
-def t_of(worse: np.ndarray, better: np.ndarray) -> float:
-    """t of the blocks' gain in held-out squares."""
-    gain = (worse - better).ravel()
-    gain = gain[(worse.ravel() != 0) | (better.ravel() != 0)]
-    with np.errstate(over="ignore"):  # of fits that diverge without some rows
-        return float(gain.mean() / (gain.std(ddof=1) / np.sqrt(len(gain)) + 1e-300)) if len(gain) > 2 else 0.0
-
-
-def t_of_places(worse: np.ndarray, better: np.ndarray) -> float:
-    """t of the logarithms of the blocks' gains: a limit that is met in a few places is not one large gain by chance."""
-    told = (worse.ravel() != 0) | (better.ravel() != 0)
-    floor = better.ravel()[told].mean()
-    logs = np.log((worse.ravel()[told] + floor) / (better.ravel()[told] + floor))
-    return float(logs.mean() / (logs.std(ddof=1) / np.sqrt(len(logs)) + 1e-300)) if len(logs) > 2 else 0.0
-
-
-def t_of_recordings(worse: np.ndarray, better: np.ndarray, runs: np.ndarray) -> float:
-    """t of the logarithms of the recordings' gains, (blocks, windows) with the run (windows,) of each: all count alike.
-
-    Blocks of one recording gain or lose together; a recording in which nothing moves tells nothing.
-    """
-    sums = np.stack([np.bincount(runs, x.sum(0)) / np.maximum(np.bincount(runs), 1) for x in (worse, better)])
-    sums = sums[:, np.bincount(runs) > 0]
-    floor = LEAST_OF_A_RECORDING * sums[1].mean()
-    logs = np.log((sums[0] + floor) / (sums[1] + floor))
-    return float(logs.mean() / (logs.std(ddof=1) / np.sqrt(len(logs)) + 1e-300)) if len(logs) > 2 else 0.0
-
-
 def _best(
     here: Setting, now: Model, tried: Sequence[Tried], nearest: list[tuple[Name, float, str]]
 ) -> tuple[tuple[Named, Model] | None, float]:
@@ -599,67 +528,6 @@ def _without_folds(here: Setting, now: Model, held: np.ndarray) -> np.ndarray:
 def _rms(here: Setting, squares: np.ndarray) -> float:
     """Whitened squares as an RMS of position: rad, or m."""
     return float(np.sqrt(max(squares.sum(), 0.0) / counted(here.data) * np.mean(here.spread**2)))
-
-
-def sized(here: Setting, one: Tried) -> bool:
-    """Whether its first number is clear of no effect, and on no bound of the search."""
-    return not why_not_sized(here, one)
-
-
-def why_not_sized(here: Setting, one: Tried) -> str:
-    """Why a candidate's numbers make no cause of it, or nothing."""
-    found = one.state.fit
-    column = int(np.flatnonzero(found.free == one.candidate.entries[0])[0])
-    error = standard_errors(found, one.state.structure.data)[column]
-    value = found.theta[one.candidate.entries[0]]
-    kind = one.candidate.kind
-    if kind.telling is not None:  # without it it is what it contains
-        width = one.candidate.entries[kind.telling]
-        spread = standard_errors(found, one.state.structure.data)[int(np.flatnonzero(found.free == width)[0])]
-        if not found.theta[width] > CLEAR_OF_NOTHING * spread:
-            return "it is no more than what it contains"
-    bounds = here.bounds[list(one.candidate.entries)] if not kind.elastic else np.zeros((0, 2))
-    if any(found.theta[e] >= high for e, (_, high) in zip(one.candidate.entries, bounds, strict=False)):
-        return "a number of it ends at the bound of the search"
-    if kind.falls_off is not None:  # beyond every speed it is plain friction
-        speed = one.candidate.entries[kind.falls_off]
-        if found.theta[speed] > max(_top_speed(here, j) for j in one.state.structure.table[speed].at):
-            return "no motion is as fast as the speed that it tells"
-    if not shown(here, one.candidate, found.theta):
-        return "the motion covers too little of it: so short a piece could be any smooth torque"
-    if not kind.signed:
-        clear = np.isfinite(error) and error < OF_ITS_SIZE * abs(value) + 1e-12
-    elif kind.together > 1:
-        clear = _clear_together(one)
-    else:
-        clear = np.isfinite(error) and abs(value - kind.neutral) > CLEAR_OF_NOTHING * error
-    return "" if clear else "its size may be nothing"
-
-
-def _clear_together(one: Tried) -> bool:
-    """Whether two numbers are a size together, such as sine and cosine: as sure as one number is to be."""
-    found = one.state.fit
-    entries = [k for k in one.candidate.entries[: one.candidate.kind.together] if k in found.free]
-    at = [int(np.flatnonzero(found.free == k)[0]) for k in entries]
-    covariance = System(found.sums, one.state.structure.data, found.start).covariance(found.free < 0)[np.ix_(at, at)]
-    told = np.isfinite(np.diag(covariance))
-    size = found.theta[entries][told]
-    if not told.any():
-        return False
-    wald = float(size @ np.linalg.pinv(covariance[np.ix_(told, told)], hermitian=True) @ size)
-    chance = 2 * ndtr(-CLEAR_OF_NOTHING)
-    return wald > (CLEAR_OF_NOTHING**2 if told.sum() == 1 else 2 * gammainccinv(told.sum() / 2, chance))
-
-
-def _top_speed(here: Setting, coordinate: int) -> float:
-    """The fastest that a joint moved, over five rows (rad/s or m/s)."""
-    column = here.loop.measured.index(coordinate)
-    return max(
-        float(
-            np.abs(run.position[4:, column] - run.position[:-4, column]).max(initial=0.0) / (run.time[4] - run.time[0])
-        )
-        for run in here.runs
-    )
 
 
 def _verdict(here: Setting, beyond: float, found: Sequence[Named]) -> Verdict:

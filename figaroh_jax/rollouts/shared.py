@@ -18,13 +18,14 @@ import numpy as np
 
 from .causes import Candidate
 from .fit import Fit, fit
+from .found import Named, Tried
 from .gates import rms_of, standing
 from .loop import turns
 from .parameters import of_one_number, values
 from .screening import LATE, ROUGH, Standing, joint_of
-from .search import Named, Tried, sized, t_of_recordings
 from .setting import Setting, Structure, by_recording, free_entries, start_values
-from .thresholds import CONFIDENT, FEWEST_JOINTS, GAIN, HOPEFUL, T_BESIDE_REST
+from .sizes import sized
+from .thresholds import CONFIDENT, FEWEST_JOINTS, GAIN, HOPEFUL, T_BESIDE_REST, t_of_recordings
 
 __all__ = ["as_one_number", "at_all_joints", "of_one_kind", "t_together"]
 

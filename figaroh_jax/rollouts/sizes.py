@@ -12,13 +12,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import gammaincc, ndtri
+from scipy.special import gammaincc, gammainccinv, ndtr, ndtri
 
 from .causes import Candidate, springs
 from .fit import Fit, System, fit, standard_errors
+from .found import Tried
 from .parameters import BOUNDS, UNITS, values
 from .setting import Setting, Structure
-from .thresholds import TOLD
+from .starting import shown
+from .thresholds import CLEAR_OF_NOTHING, OF_ITS_SIZE, TOLD
 
 __all__ = [
     "fitted_without",
@@ -27,7 +29,9 @@ __all__ = [
     "least_sure",
     "possible",
     "simpler",
+    "sized",
     "told_errors",
+    "why_not_sized",
     "why_nothing",
 ]
 
@@ -142,3 +146,64 @@ def _clear(c: Candidate, structure: Structure, last: Fit, errors: np.ndarray) ->
     wide = errors[at] / np.sqrt(np.diag(own))
     wald = float(size @ np.linalg.pinv(own * np.outer(wide, wide), hermitian=True) @ size)
     return float(-ndtri(max(gammaincc(len(at) / 2, wald / 2), 1e-300) / 2))
+
+
+def sized(here: Setting, one: Tried) -> bool:
+    """Whether its first number is clear of no effect, and on no bound of the search."""
+    return not why_not_sized(here, one)
+
+
+def why_not_sized(here: Setting, one: Tried) -> str:
+    """Why a candidate's numbers make no cause of it, or nothing."""
+    found = one.state.fit
+    column = int(np.flatnonzero(found.free == one.candidate.entries[0])[0])
+    error = standard_errors(found, one.state.structure.data)[column]
+    value = found.theta[one.candidate.entries[0]]
+    kind = one.candidate.kind
+    if kind.telling is not None:  # without it it is what it contains
+        width = one.candidate.entries[kind.telling]
+        spread = standard_errors(found, one.state.structure.data)[int(np.flatnonzero(found.free == width)[0])]
+        if not found.theta[width] > CLEAR_OF_NOTHING * spread:
+            return "it is no more than what it contains"
+    bounds = here.bounds[list(one.candidate.entries)] if not kind.elastic else np.zeros((0, 2))
+    if any(found.theta[e] >= high for e, (_, high) in zip(one.candidate.entries, bounds, strict=False)):
+        return "a number of it ends at the bound of the search"
+    if kind.falls_off is not None:  # beyond every speed it is plain friction
+        speed = one.candidate.entries[kind.falls_off]
+        if found.theta[speed] > max(_top_speed(here, j) for j in one.state.structure.table[speed].at):
+            return "no motion is as fast as the speed that it tells"
+    if not shown(here, one.candidate, found.theta):
+        return "the motion covers too little of it: so short a piece could be any smooth torque"
+    if not kind.signed:
+        clear = np.isfinite(error) and error < OF_ITS_SIZE * abs(value) + 1e-12
+    elif kind.together > 1:
+        clear = _clear_together(one)
+    else:
+        clear = np.isfinite(error) and abs(value - kind.neutral) > CLEAR_OF_NOTHING * error
+    return "" if clear else "its size may be nothing"
+
+
+def _clear_together(one: Tried) -> bool:
+    """Whether two numbers are a size together, such as sine and cosine: as sure as one number is to be."""
+    found = one.state.fit
+    entries = [k for k in one.candidate.entries[: one.candidate.kind.together] if k in found.free]
+    at = [int(np.flatnonzero(found.free == k)[0]) for k in entries]
+    covariance = System(found.sums, one.state.structure.data, found.start).covariance(found.free < 0)[np.ix_(at, at)]
+    told = np.isfinite(np.diag(covariance))
+    size = found.theta[entries][told]
+    if not told.any():
+        return False
+    wald = float(size @ np.linalg.pinv(covariance[np.ix_(told, told)], hermitian=True) @ size)
+    chance = 2 * ndtr(-CLEAR_OF_NOTHING)
+    return wald > (CLEAR_OF_NOTHING**2 if told.sum() == 1 else 2 * gammainccinv(told.sum() / 2, chance))
+
+
+def _top_speed(here: Setting, coordinate: int) -> float:
+    """The fastest that a joint moved, over five rows (rad/s or m/s)."""
+    column = here.loop.measured.index(coordinate)
+    return max(
+        float(
+            np.abs(run.position[4:, column] - run.position[:-4, column]).max(initial=0.0) / (run.time[4] - run.time[0])
+        )
+        for run in here.runs
+    )

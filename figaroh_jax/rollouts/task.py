@@ -29,12 +29,13 @@ from .creep import REMARK, creep_notes, searched_with_both
 from .data import Run, Stretch, as_recorded, noise_of, regular, windows, without_gaps
 from .faults import refuse_other_order, refuse_other_units
 from .fit import Fit
+from .found import Named, Search
 from .loop import Loop, alike, brought_back, turns
 from .own import left_out
 from .parameters import put, unit_of, values
 from .reading import driven_joints, load_loop
 from .rest import nearest_of, parts_of, relative_rest
-from .search import Named, Search, search
+from .search import search
 from .sensitivity import predicted
 from .setting import Setting, Structure, begun, residuals, setting
 from .sizes import is_excepted, is_open, possible, told_errors
