@@ -19,6 +19,7 @@ from figaroh_jax.recordings.draft import draft_task
 from figaroh_jax.recordings.draft_columns import Undecided
 from figaroh_jax.recordings.progress import listener
 from figaroh_jax.recordings.reading import read_table
+from figaroh_jax.recordings.tables import Source
 
 
 @pytest.fixture(scope="module")
@@ -342,6 +343,81 @@ def test_iso_times_as_words_are_a_clock_in_any_file(made, form: str, tmp_path: P
         assert_read(drafted(urdf, file, tmp_path)[1], run)
 
 
+# JSON
+
+
+@pytest.mark.parametrize("form", ["rows", "lines", "columns", "arrays"])
+def test_json_of_pandas_and_of_scripts_is_read(made, form: str, tmp_path: Path):
+    """Rows and columns as pandas writes them, and lists a sample in an object beside what is no recording."""
+    import pandas as pd
+
+    urdf, joints, run = made
+    frame = pd.DataFrame({f"pos_{j}": run["position"][:, k] for k, j in enumerate(joints)})
+    frame = frame.assign(**{f"effort_{j}": run["torque"][:, k] for k, j in enumerate(joints)}, stamp=run["time"])
+    file = tmp_path / ("run.jsonl" if form == "lines" else "run.json")
+    if form in ("rows", "lines"):
+        frame.to_json(file, orient="records", lines=form == "lines", double_precision=15)
+    elif form == "columns":
+        file.write_text(json.dumps(frame.to_dict(orient="list")))
+    else:
+        log = {"t": run["time"].tolist(), "q": run["position"].tolist(), "tau": run["torque"].tolist()}
+        file.write_text(json.dumps({"robot": "small", "rate": 250, "log": log}))
+    entry, recording = drafted(urdf, file, tmp_path)
+    assert (entry["position"] == "log.q") == (form == "arrays")
+    assert_read(recording, run)
+
+
+def test_runs_in_json_are_drafted_one_by_one_and_one_must_be_named(made, tmp_path: Path):
+    """As scripts that move a servo write them: a list of runs of several lengths, a kind and targets in words."""
+    urdf, joints, run = made
+    half = len(run["time"]) // 2
+    pieces = [slice(0, half), slice(half, half + 200), slice(half + 200, None)]
+    keys = {"time": "t", "position": "q", "torque": "tau"}
+    runs = [
+        {"type": "step", "id": k, "targets": [], **{name: run[key][at].tolist() for key, name in keys.items()}}
+        for k, at in enumerate(pieces)
+    ]
+    file, task = tmp_path / "runs.json", tmp_path / "task.yaml"
+    file.write_text(json.dumps({"config": {"hz": 250}, "data": runs}))
+    task.write_text(draft_task(urdf, [file], unit="rad").text)
+    told = load_task(task)
+    assert [one.episode for one in told.data] == [0, 1, 2]
+    for one, at in zip(read_recordings(told, load_robot(told)), pieces, strict=True):
+        np.testing.assert_allclose(one.position, run["position"][at], rtol=0, atol=1e-12)
+    with pytest.raises(InputError, match="holds 3 runs; `episode` must say which, 0 to 2"):
+        read_table(file, "data")
+    with pytest.raises(InputError, match="no run 3; `episode` is 0 to 2"):
+        read_table(file, "data", Source(episode=3))
+
+
+def test_rows_of_json_with_a_scanner_are_rows(tmp_path: Path):
+    """Long lists beside a stamp that rises are readings of one sample; without `episode` they are no runs."""
+    rows = [{"t": 0.01 * k, "q": [0.1 * k, 1.0], "imu": {"a": k}, "ranges": [k] * 360} for k in range(80)]
+    (tmp_path / "run.json").write_text(json.dumps(rows))
+    table = read_table(tmp_path / "run.json", "data")
+    assert table.names == ("t", "q", "imu.a", "ranges")
+    np.testing.assert_array_equal(table.read("q"), [row["q"] for row in rows])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{"q": [1, 2', "line 1, column 12 is not JSON"),
+        ('{"q": [1], "q": [2]}', "the key 'q' appears twice"),
+        ('{"q": [[1, 2], [3]]}', "'q', row 1 .from 0.: a list of 1, but a list of 2 in row 0"),
+        ('{"q": [1, null, 2]}', "'q', row 1 .from 0.: an empty cell is not a number"),
+        ('{"q": [1, "two"]}', "'q', row 1 .from 0.: 'two' is not a number"),
+        ('{"rate": 250}', "holds no lists of numbers"),
+        ("[" * 100_000, "too deep"),
+        ('{"q": [1' + "0" * 400 + "]}", "damaged or of another format"),
+    ],
+)
+def test_what_is_wrong_in_json_is_said_with_its_place(tmp_path: Path, text: str, said: str):
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(InputError, match=said):
+        read_table(tmp_path / "run.json", "data").read("q")
+
+
 # Text
 
 
@@ -483,7 +559,7 @@ def test_a_format_whose_package_is_missing_names_the_extra(tmp_path: Path, monke
         read_table(tmp_path / "run.h5", "data")
 
 
-@pytest.mark.parametrize("form", ["mcap", "db3", "h5"])
+@pytest.mark.parametrize("form", ["mcap", "db3", "h5", "json"])
 def test_damaged_files_are_one_message(made, tmp_path: Path, form: str):
     """Bytes changed at random, and files cut off: an answer or an `InputError`, whatever the library raises."""
     import h5py
@@ -494,6 +570,8 @@ def test_damaged_files_are_one_message(made, tmp_path: Path, form: str):
     if form in ("mcap", "db3"):
         folder = bag(tmp_path / "bag", joints, short, "MCAP" if form == "mcap" else "SQLITE3")
         next(one for one in folder.iterdir() if one.suffix == file.suffix).rename(file)
+    elif form == "json":
+        file.write_text(json.dumps({key: value.tolist() for key, value in short.items()}))
     else:
         with h5py.File(file, "w") as opened:
             opened["q"] = short["position"]

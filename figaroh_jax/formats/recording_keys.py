@@ -96,7 +96,7 @@ class RecordingEntry(Keys):
     file: Path
     format: Literal["rtde", "libfranka"] | None = None  # a robot's own log: its columns are known by name
     topic: str | None = None  # of a ROS bag or an MCAP file; None: the one topic of joints
-    episode: Annotated[int, Field(ge=0)] | None = None  # of a LeRobot folder
+    episode: Annotated[int, Field(ge=0)] | None = None  # of a LeRobot folder, or of a list of runs in JSON
     position: Columns
     time: str | None = None  # s
     rate: Positive | None = None  # Hz

@@ -40,7 +40,11 @@ KEYS: dict[str, tuple[str, str, str]] = {
     "data[].file": ("", "run1.csv", "the entry is refused"),
     "data[].format": ("", "rtde", "columns are those that the entry names; with it those of the robot's log"),
     "data[].topic": ("", "/joint_states", "the one topic of joints in the bag; several are an error that lists them"),
-    "data[].episode": ("", "3", "the only episode of a LeRobot folder; of several one must be named"),
+    "data[].episode": (
+        "",
+        "3",
+        "the only episode of a LeRobot folder, or run of a list of them in JSON; of several one must be named",
+    ),
     "data[].position": ("rad, m", "[q1, q2]", "the entry is refused; an array, a list of columns or a prefix"),
     "data[].time": ("s", "t", "`rate` must say how often samples come; postures are counted"),
     "data[].rate": ("Hz", "500", "`time` must name the column of the stamps"),

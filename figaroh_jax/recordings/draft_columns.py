@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..rigid.model import RobotModel
 from .dataset import Driven
 from .joined import in_halves
-from .reading import BAGS, kind_of, lerobot_episodes, read_table
+from .reading import BAGS, episodes_of, kind_of, read_table
 from .tables import Source, Table, leave_out, not_increasing
 
 __all__ = [
@@ -110,8 +110,8 @@ def read_tables(files: Sequence[Path], topic: str | None) -> Iterator[tuple[Tabl
     """Every recording with the keys of a task that say which it is; of a folder of episodes the first few."""
     for file in files:
         path = file.resolve()
-        if kind_of(file) == "lerobot":
-            for episode in lerobot_episodes(file, "recording")[:_EPISODES]:
+        if episodes := episodes_of(file, "recording"):
+            for episode in episodes[:_EPISODES]:
                 source = Source(episode=episode)
                 yield read_table(file, "recording", source), {"file": str(path), "episode": episode}
             continue

@@ -1,4 +1,4 @@
-"""Recording files: NumPy, text, MATLAB, HDF5, Parquet, ROS bags and LeRobot folders behind one function."""
+"""Recording files: NumPy, text, JSON, MATLAB, HDF5, Parquet, ROS bags and LeRobot folders behind one function."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from ..formats.files import plain_file
 from .bags import read_bag
 from .containers import read_npz
 from .joined import joined
+from .jsonfiles import JSON, json_episodes, read_json
 from .reader_process import episodes_apart, read_apart
 from .tables import LARGEST, Source, Table
 from .textfiles import read_text
 
-__all__ = ["BAGS", "FORMATS", "TEXT", "kind_of", "lerobot_episodes", "read_table"]
+__all__ = ["BAGS", "FORMATS", "TEXT", "episodes_of", "kind_of", "read_table"]
 
 LARGEST_FILE = 2 << 30  # bytes
 TEXT = (".csv", ".tsv", ".txt", ".log", ".dat")
 _HDF5 = (".h5", ".hdf5", ".hdf")
 _FOLDERS = ("rosbag2", "lerobot")
 BAGS = (".bag", ".mcap", ".db3", "rosbag2")
-FORMATS = (".npz", ".csv", ".parquet", ".mat", *TEXT[1:], *_HDF5, *BAGS[:3])
-_OWNERS = {"topic": "ROS bags and MCAP files", "episode": "LeRobot folders"}
+FORMATS = (".npz", ".csv", ".parquet", ".mat", *TEXT[1:], *JSON, *_HDF5, *BAGS[:3])
+_OWNERS = {"topic": "ROS bags and MCAP files", "episode": "LeRobot folders and lists of runs in JSON"}
 _WHOLE = Source()
 
 
@@ -38,7 +39,7 @@ def read_table(file: Path, key: str, source: Source = _WHOLE) -> Table:
         raise InputError(f"{file} ({key}): recordings are {', '.join(FORMATS)}, not '{file.suffix or file.name}'")
     if suffix not in _FOLDERS:
         plain_file(file, f"{file} ({key})", "a recording file", LARGEST if suffix in TEXT else LARGEST_FILE, FORMATS)
-    for name, given, where in (("topic", source.topic, BAGS), ("episode", source.episode, ("lerobot",))):
+    for name, given, where in (("topic", source.topic, BAGS), ("episode", source.episode, ("lerobot", *JSON))):
         if given is not None and suffix not in where:
             raise InputError(f"{file} ({key}): `{name}` is of {_OWNERS[name]}, which this file is not")
     with _damage(file, key, suffix):
@@ -52,10 +53,13 @@ def read_table(file: Path, key: str, source: Source = _WHOLE) -> Table:
     return guarded if suffix in (*BAGS, "lerobot") or source.form is not None else joined(guarded)
 
 
-def lerobot_episodes(folder: Path, key: str) -> tuple[int, ...]:
-    """Numbers of the episodes of a LeRobot folder, as far as their files are there."""
-    with _damage(folder, key, "lerobot"):
-        return episodes_apart(folder)
+def episodes_of(file: Path, key: str) -> tuple[int, ...]:
+    """Numbers of the episodes of a LeRobot folder, as far as their files are there, and of a list of runs in JSON."""
+    kind = kind_of(file)
+    if kind in JSON:
+        plain_file(file, f"{file} ({key})", "a recording file", LARGEST_FILE, FORMATS)
+    with _damage(file, key, kind):
+        return episodes_apart(file) if kind == "lerobot" else json_episodes(file) if kind in JSON else ()
 
 
 @contextmanager
@@ -92,6 +96,7 @@ _READERS: dict[str, Callable[[Path, Source], Table]] = {
     ".parquet": partial(read_apart, ".parquet"),
     "lerobot": partial(read_apart, "lerobot"),
     **dict.fromkeys(_HDF5, partial(read_apart, ".h5")),
+    **dict.fromkeys(JSON, read_json),
     **dict.fromkeys(TEXT, lambda file, source: read_text(file, source.form)),
     **dict.fromkeys(BAGS, lambda file, source: read_bag(file, source.topic)),
 }
