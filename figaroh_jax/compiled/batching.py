@@ -30,6 +30,7 @@ __all__ = [
     "CPU_OPTIONS",
     "aligned",
     "chunk_size",
+    "filtered_program",
     "host_blocks",
     "in_one_program",
     "in_chunks",
@@ -67,6 +68,20 @@ def program(
     """
     elsewhere = jax.jit(function, **options)
     on_cpu = Program(function, options=dict(cpu)) if kept else jax.jit(function, compiler_options=dict(cpu), **options)
+
+    @wraps(function)
+    def call(*arguments: Any) -> Any:
+        return (on_cpu if on_host(*arguments) else elsewhere)(*arguments)
+
+    return call
+
+
+def filtered_program(function: Callable[..., Any], cpu: Mapping[str, Any] = CPU_OPTIONS) -> Callable[..., Any]:
+    """`program` of pytrees that hold more than arrays, by `equinox.filter_jit`."""
+    import equinox as eqx  # the kernels have no use for it
+
+    elsewhere = eqx.filter_jit(function)
+    on_cpu = eqx.filter_jit(function, compiler_options=dict(cpu))  # pyright: ignore[reportCallIssue]
 
     @wraps(function)
     def call(*arguments: Any) -> Any:

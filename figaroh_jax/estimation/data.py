@@ -22,6 +22,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Shaped
 
+from ..compiled.batching import filtered_program
 from ..compiled.precision import in_float64
 from ..effects.extended import ExtendedModel, changed_robot, extend, opened, read_position, read_sensors
 from ..effects.kinematic import PostureMotion, Postures, twists_of
@@ -361,7 +362,7 @@ def residual(model: RobotModel | ExtendedModel, data: Any) -> Float[Array, " row
 
 
 @in_float64
-@eqx.filter_jit
+@filtered_program
 def _residual(model: ExtendedModel, data: tuple[Data, ...]) -> Float[Array, " rows"]:
     parts = [one.residual(model) for one in data]
     return parts[0] if len(parts) == 1 else jnp.concatenate(parts)

@@ -7,7 +7,7 @@ rows of the data (`data`). Optimistix solves it, and differentiates it through t
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import prod
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float
 
-from ..compiled.batching import DRAFT_OPTIONS, FEW, on_host, traced
+from ..compiled.batching import DRAFT_OPTIONS, FEW, filtered_program, on_host, traced
 from ..compiled.precision import in_float64
 from ..effects.extended import ExtendedModel, extend
 from ..errors import InputError, check_real
@@ -30,6 +30,7 @@ from . import posefit
 from .blockwise import BlockLevenbergMarquardt, normal_of
 from .data import Data, PoseData, as_data
 from .free import Free, apply, chosen_of
+from .hostfit import descend
 from .posesolver import NormalEquations, cut_weights, normal_equations
 from .priors import rigid_prior
 from .solution import Fit
@@ -124,6 +125,8 @@ def fit(
     problem = _Problem(whole, parts, precision, closed, chosen)
     if bounds is not None:
         return _bounded(problem, *_limits(chosen, bounds), max_steps)
+    if solver is None and closed is None and on_host(problem):
+        return _descended(problem, max_steps)
     if solver is None:
         solver = BlockLevenbergMarquardt() if closed else optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
     return _solved(problem, solver, max_steps)
@@ -133,6 +136,44 @@ def fit(
 def _solved(problem: _Problem, solver: Any, max_steps: int) -> Fit:
     solve = _solve_quick if _brief(problem) else _solve
     return replace(solve(replace(problem, free=problem.free.unnamed()), solver, max_steps), free=problem.free)
+
+
+@in_float64
+def _descended(problem: _Problem, max_steps: int) -> Fit:
+    """The fit with its steps on the host: the programs are the rows with their Jacobian and what the numbers change."""
+    bare = replace(problem, free=problem.free.unnamed())
+    bare = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, bare)  # handed over once
+    linear = _linear_quick if _brief(problem) else _linear
+
+    def rows_at(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        jacobian, rows = linear(jnp.asarray(y), bare)
+        return np.asarray(rows), np.asarray(jacobian)
+
+    found = descend(rows_at, np.asarray(problem.precision, float), max_steps)
+    square, precision = float(found.rows @ found.rows), np.asarray(problem.precision)
+    model, data = _placed(jnp.asarray(found.at), bare)
+    results = optimistix.RESULTS
+    failed = results.nonlinear_divergence if found.stuck else results.nonlinear_max_steps_reached
+    whole = _put_together(
+        replace(problem, model=model, data=data),
+        found.at,
+        _told(found.jacobian, found.rows, square, precision, np),
+        np.float64(0.5 * (square + np.sum(precision * found.at**2))),
+        found.rows,
+        results.successful if found.converged else failed,
+        {"max_steps": max_steps, "num_steps": np.int64(found.steps)},
+    )
+    return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, (np.ndarray, np.generic)) else x, whole)
+
+
+def _linearised(y: Array, problem: _Problem) -> tuple[Array, Array]:
+    """Jacobian of the rows (rows, numbers), and the rows."""
+
+    def both(y: Array) -> tuple[Array, Array]:
+        rows = problem.rows(y)
+        return rows, rows
+
+    return jax.jacfwd(both, has_aux=True)(y)
 
 
 def _brief(problem: _Problem) -> bool:
@@ -152,20 +193,31 @@ def _least_squares(problem: _Problem, solver: Any, max_steps: int) -> Fit:
     return _fit_at(problem, found.value, found.result, found.stats)
 
 
-_solve = eqx.filter_jit(_least_squares)
-_solve_quick = eqx.filter_jit(_least_squares, compiler_options=DRAFT_OPTIONS)  # pyright: ignore[reportCallIssue]
+_solve, _linear = filtered_program(_least_squares), filtered_program(_linearised)
+_solve_quick, _linear_quick, _placed = (
+    filtered_program(function, DRAFT_OPTIONS)
+    for function in (_least_squares, _linearised, lambda y, problem: problem.at(y))
+)
 
 
 def _fit_at(problem: _Problem, y: Array, result: Any, stats: dict[str, Any]) -> Fit:
     model, data = problem.at(y)
     rows = problem.rows(y)
     still = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, (problem, y))
-    covariance, hidden, rank = _covariance(*still)
-    scale = jnp.asarray(problem.free.sizes)
+    told = _covariance(*still)
     cost = 0.5 * (jnp.sum(rows**2) + jnp.sum(problem.precision * y**2))
+    return _put_together(replace(problem, model=model, data=data), y, told, cost, rows, result, stats)
+
+
+def _put_together(
+    fitted: _Problem, y: Any, told: Sequence[Any], cost: Any, rows: Any, result: Any, stats: dict[str, Any]
+) -> Fit:
+    """The fit with numbers, covariance and share in SI units; `fitted` holds the model and the data with them."""
+    scale = fitted.free.sizes
+    covariance, hidden, rank = told
     return Fit(
-        model,
-        data,
+        fitted.model,
+        fitted.data,
         y * scale,
         covariance * scale[:, None] * scale,
         hidden,
@@ -174,34 +226,37 @@ def _fit_at(problem: _Problem, y: Array, result: Any, stats: dict[str, Any]) -> 
         rank,
         result,
         {key: value for key, value in stats.items() if value is not None},
-        problem.free,
+        fitted.free,
     )
 
 
 def _covariance(problem: _Problem, y: Array) -> tuple[Array, Array, Array]:
     """Covariance of y for rows of one variance, share of each number in undetermined directions, and rank."""
-
-    def both(y: Array) -> tuple[Array, Array]:
-        rows = problem.rows(y)
-        return rows, rows
-
     if problem.closed is None:
-        J, rows = jax.jacfwd(both, has_aux=True)(y)
-        information = jnp.matmul(J.T, J, precision=jax.lax.Precision.HIGHEST) + jnp.diag(jnp.asarray(problem.precision))
-        counted = jnp.sum((rows != 0) | jnp.any(J != 0, axis=1))
-        square = jnp.sum(rows**2)
-    else:
-        normal = problem.normal(y)
-        information = normal.matrix
-        counted = sum(jnp.sum(jnp.asarray(w) > 0) for w in jax.tree.leaves(problem.closed.weights))
-        square = 2.0 * normal.cost - jnp.sum(problem.precision * y**2)
-    size = jnp.sqrt(jnp.maximum(jnp.diagonal(information), 1e-300))
-    values, vectors = jnp.linalg.eigh(information / size[:, None] / size)
+        J, rows = _linearised(y, problem)
+        return _told(J, rows, jnp.sum(rows**2), jnp.asarray(problem.precision), jnp)
+    normal = problem.normal(y)
+    counted = sum(jnp.sum(jnp.asarray(w) > 0) for w in jax.tree.leaves(problem.closed.weights))
+    square = 2.0 * normal.cost - jnp.sum(problem.precision * y**2)
+    return _spread(normal.matrix, counted, square, jnp)
+
+
+def _told(J: Any, rows: Any, square: Any, precision: Any, lib: Any) -> tuple[Any, Any, Any]:
+    """`_covariance` of rows with their Jacobian; `lib` is NumPy or JAX."""
+    highest = {"precision": jax.lax.Precision.HIGHEST} if lib is jnp else {}
+    information = lib.matmul(J.T, J, **highest) + lib.diag(precision)
+    counted = lib.sum((rows != 0) | lib.any(J != 0, axis=1))
+    return _spread(information, counted, square, lib)
+
+
+def _spread(information: Any, counted: Any, square: Any, lib: Any) -> tuple[Any, Any, Any]:
+    size = lib.sqrt(lib.maximum(lib.diagonal(information), 1e-300))
+    values, vectors = lib.linalg.eigh(information / size[:, None] / size)
     kept = values > NULL * values[-1]
-    inverse = (vectors * jnp.where(kept, 1.0 / jnp.where(kept, values, 1.0), 0.0)) @ vectors.T / size[:, None] / size
-    rank = jnp.sum(kept)
-    variance = square / jnp.maximum(counted - rank, 1)
-    return variance * inverse, jnp.sum(jnp.where(kept, 0.0, vectors**2), axis=1), rank
+    inverse = (vectors * lib.where(kept, 1.0 / lib.where(kept, values, 1.0), 0.0)) @ vectors.T / size[:, None] / size
+    rank = lib.sum(kept)
+    variance = square / lib.maximum(counted - rank, 1)
+    return variance * inverse, lib.sum(lib.where(kept, 0.0, vectors**2), axis=1), rank
 
 
 def _precision(free: Free, model: ExtendedModel, prior: Mapping[str, Any]) -> Float[np.ndarray, " numbers"]:
