@@ -1,9 +1,8 @@
-r"""Levenberg-Marquardt of which rows and Jacobian are one program and the steps are NumPy's: little to compile.
+r"""Least squares of which rows and Jacobian are one program and the steps are SciPy's: little to compile.
 
 A solver inside of a program puts the rows into it several times (to step, to end, for the covariance), and long rows,
-as those of a simulation, then take a minute to compile. Here they are compiled once. Damping follows Nielsen (1999), on
-columns of one length (Marquardt 1963); each step comes from the QR factor of the Jacobian, so that nothing squares its
-condition number.
+as those of a simulation, then take a minute to compile. Here they are compiled once. SciPy's trust region reflective
+method steps by the SVD of the Jacobian, on columns scaled to one length, so that nothing squares its condition number; near the minimum Gauss and Newton's whole steps follow, for which no cost need fall.
 """
 
 from __future__ import annotations
@@ -13,12 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import least_squares
 
 __all__ = ["Ended", "descend"]
 
-_TOLERANCE = 1e-10  # of the numbers in their sizes, and of the cost: a step below it in both is the last one
-_ROUNDING = 1e-13  # of the cost: which of two points is better, costs cannot tell below it
-_DAMPING, _LEAST, _MOST = 1e-3, 1e-14, 1e12  # at the start and its limits, of columns of one length
+_TOLERANCE = 1e-10  # of the numbers in their sizes: a step below it is the last one
+_COST = 1e-10  # of the squares: where SciPy's steps gain less, whole ones end the search; costs cannot tell its square
+_LEFT = 1e-6  # of the squares: what linear rows promise to take off at a minimum
+_RIDGE = 1e-7  # of the columns at the start: numbers that no row shows stay, and SciPy's whole steps are such
+_SHOWN = 1e-10  # of the largest singular value: directions below it are shown by no row
 
 
 class Ended(NamedTuple):
@@ -39,59 +41,66 @@ def descend(
 ) -> Ended:
     r"""The least $\tfrac12 |r(y)|^2 + \tfrac12 \sum_k p_k y_k^2$ from y = 0; `rows_at` gives r and its Jacobian.
 
-    `precision` is p, `max_steps` limits the steps tried. One to where the rows are not finite is no step, and the
-    search is `stuck` at once where they are not at the start.
+    `precision` is p, `max_steps` limits the steps tried. One to where the rows are not finite is no step; the search
+    is `stuck` where they, or the Jacobian, are not finite at the start, and where only such steps would lead on.
     """
     root = np.sqrt(precision)
-    at = np.zeros(len(root))
-    ended = Ended(at, *rows_at(at), 0)
-    cost = _cost(ended, root)
-    if not (np.isfinite(cost) and np.isfinite(ended.jacobian).all()):
-        return ended._replace(stuck=True)
-    factor, right, scale = _triangle(ended, root)
-    damping, growth, last = _DAMPING, 2.0, np.inf
-    for tried in range(1, max_steps + 1):
-        step = scale * _damped(factor, right, damping)
-        promised = 0.5 * float(right @ right - np.sum((factor @ (step / scale) + right) ** 2))
-        blind = promised <= _ROUNDING * cost
-        trial = Ended(ended.at + step, *rows_at(ended.at + step), tried)
-        gained = cost - _cost(trial, root)
-        if not (gained >= (-10 * _ROUNDING * cost if blind else 0.0) and np.isfinite(trial.jacobian).all()):
-            damping, growth, ended = damping * growth, 2.0 * growth, ended._replace(steps=tried)
-            if damping > _MOST:
-                return ended._replace(converged=blind, stuck=not blind)
-            continue
-        ended, cost = trial, cost - gained
-        length = float(np.max(np.abs(step) / (1.0 + np.abs(ended.at)), initial=0.0))
-        if length < _TOLERANCE and abs(gained) < _TOLERANCE * (1.0 + cost) or blind and length > 0.5 * last:
-            return ended._replace(converged=True)
-        last = length if blind else np.inf
-        shrink = 0.1 if blind else max(0.1, 1.0 - (2.0 * gained / promised - 1.0) ** 3)
-        damping, growth = max(damping * shrink, _LEAST), 2.0
-        factor, right, scale = _triangle(ended, root)
-    return ended
+    held = np.flatnonzero(root)
+    start = np.zeros(len(root))
+    latest = (start, *rows_at(start))
+    if not all(np.isfinite(x).all() for x in latest):
+        return Ended(*latest, 0, stuck=True)
+
+    def seen(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and Jacobian with those of the prior; NaN, to which SciPy does not step, where one is not finite."""
+        nonlocal latest
+        if not np.array_equal(y, latest[0]):
+            latest = (y.copy(), *rows_at(y))
+        _, rows, jacobian = latest
+        rows = rows if np.isfinite(jacobian).all() else np.full_like(rows, np.nan)
+        return np.concatenate([rows, (root * y)[held]]), np.concatenate([jacobian, np.diag(root)[held]])
+
+    length = np.sqrt((seen(start)[1] ** 2).sum(0))
+    ridge = _RIDGE * np.where(length > 0, length, length.max(initial=1.0))
+
+    def bound(z: np.ndarray) -> np.ndarray:
+        return np.concatenate([seen(z - 1.0)[0], ridge * (z - 1.0)])
+
+    found = least_squares(
+        bound,
+        start + 1.0,  # the first steps may be as long as the numbers of the start: as their sizes, which are 1
+        lambda z: np.concatenate([seen(z - 1.0)[1], np.diag(ridge)]),
+        x_scale="jac",
+        ftol=_COST,
+        xtol=_TOLERANCE,
+        gtol=None,
+        max_nfev=max_steps + 1,
+    )
+    at, steps = found.x - 1.0, found.nfev - 1
+    rows, jacobian = seen(at)
+    step, promised = _whole_step(rows, jacobian)
+    while steps < max_steps and found.status > 0 and _relative(step, at) > _TOLERANCE:
+        more, slopes = seen(at + step)
+        if not more @ more <= rows @ rows * (1 + _COST**2):
+            break
+        at, rows, jacobian, steps, before = at + step, more, slopes, steps + 1, step
+        step, promised = _whole_step(rows, jacobian)
+        if _relative(step, at) > 0.5 * _relative(before, at):
+            break
+    at_rest = promised <= _LEFT * (rows @ rows) or rows @ rows <= _TOLERANCE**2 * len(rows)
+    ended, count = found.status > 0, len(latest[1])
+    return Ended(at, rows[:count], jacobian[:count], steps, bool(ended and at_rest), bool(ended and not at_rest))
 
 
-def _cost(one: Ended, root: Float[np.ndarray, " numbers"]) -> float:
-    return 0.5 * float(one.rows @ one.rows + np.sum((root * one.at) ** 2))
+def _whole_step(
+    rows: Float[np.ndarray, " rows"], jacobian: Float[np.ndarray, "rows numbers"]
+) -> tuple[Float[np.ndarray, " numbers"], float]:
+    """Gauss and Newton's step, none in directions that no row shows, and the squares that it promises to take off."""
+    length = np.sqrt((jacobian**2).sum(0))
+    scaled = jacobian / np.where(length > 0, length, 1.0)
+    step = -np.linalg.lstsq(scaled, rows, rcond=_SHOWN)[0]
+    return step / np.where(length > 0, length, 1.0), float(np.sum((scaled @ step) ** 2))
 
 
-def _triangle(
-    one: Ended, root: Float[np.ndarray, " numbers"]
-) -> tuple[Float[np.ndarray, "some numbers"], Float[np.ndarray, " some"], Float[np.ndarray, " numbers"]]:
-    """R and Q'r of rows and prior with columns of one length, and what a step in these is of the numbers."""
-    whole = np.concatenate([one.jacobian, np.diag(root)])
-    length = np.sqrt((whole**2).sum(0))
-    scale = 1.0 / np.where(length > 0, length, 1.0)
-    right = np.concatenate([one.rows, root * one.at])
-    triangle = np.asarray(np.linalg.qr(np.column_stack([whole * scale, right]), mode="r"))
-    return triangle[:, :-1], triangle[:, -1], scale
-
-
-def _damped(
-    factor: Float[np.ndarray, "some numbers"], right: Float[np.ndarray, " some"], damping: float
-) -> Float[np.ndarray, " numbers"]:
-    count = factor.shape[1]
-    whole = np.concatenate([factor, np.sqrt(damping) * np.eye(count)])
-    Q, R = np.linalg.qr(whole)
-    return -np.linalg.solve(R, Q[: len(right)].T @ right)
+def _relative(step: Float[np.ndarray, " numbers"], at: Float[np.ndarray, " numbers"]) -> float:
+    return float(np.max(np.abs(step) / (1.0 + np.abs(at)), initial=0.0))
