@@ -1,4 +1,4 @@
-"""Torques, postures and a rollout in one fit: what is hidden in an arm of MuJoCo C, which no kind of data shows alone."""
+"""Torques, postures and a rollout in one fit: it finds what is hidden in an arm of MuJoCo C."""
 
 from __future__ import annotations
 

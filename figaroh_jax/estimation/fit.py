@@ -1,7 +1,8 @@
 r"""One fit for every job: what is estimated, measured and believed in, out comes a model with its uncertainty.
 
 Least $\tfrac12 |r(\theta)|^2 + \tfrac12 \sum_k (\theta_k / \sigma_k)^2$ over the numbers that `free` names; r are the
-rows of the data (`data`). Optimistix solves it, and differentiates it through the condition of the minimum.
+rows of the data (`data`). `hostfit` solves it on the CPU; under a transformation, and with a solver of one's own,
+optimistix does, and differentiates it through the condition of the minimum.
 """
 
 from __future__ import annotations
@@ -94,8 +95,9 @@ def fit(
     from these to places, `{"joint_offset": ["elbow"], "frames": True}`. `data` as for `residual`. `prior`: one sigma
     about the given model by the same names (SI units; for `inertia` relative, as `robot.trust`). `bounds`: limits of a
     number's change, by its name or how that begins: L-BFGS-B of jaxopt then searches. `solver`: any least-squares
-    solver or minimiser of optimistix; by default `optimistix.LevenbergMarquardt`, or for postures alone
-    `BlockLevenbergMarquardt`, which is faster there.
+    solver or minimiser of optimistix; by default `BlockLevenbergMarquardt` for postures alone, else Levenberg-Marquardt
+    with its steps on the host, of which the rows are compiled once; under a transformation, and on other devices than
+    the CPU, `optimistix.LevenbergMarquardt`.
 
     A solver that fails says so in `result` (`reason` in words); `InputError` is wrong input. Differentiable by model
     and data through the condition of the minimum, and mapped by `jax.vmap`; bounded fits are not differentiable.
