@@ -95,9 +95,9 @@ def fit(
     from these to places, `{"joint_offset": ["elbow"], "frames": True}`. `data` as for `residual`. `prior`: one sigma
     about the given model by the same names (SI units; for `inertia` relative, as `robot.trust`). `bounds`: limits of a
     number's change, by its name or how that begins: L-BFGS-B of jaxopt then searches. `solver`: any least-squares
-    solver or minimiser of optimistix; by default `BlockLevenbergMarquardt` for postures alone, else Levenberg-Marquardt
-    with its steps on the host, of which the rows are compiled once; under a transformation, and on other devices than
-    the CPU, `optimistix.LevenbergMarquardt`.
+    solver or minimiser of optimistix; by default `BlockLevenbergMarquardt` for postures alone, else SciPy's
+    `least_squares`, for which the rows are compiled once; under a transformation, and on other devices than the CPU,
+    `optimistix.LevenbergMarquardt`.
 
     A solver that fails says so in `result` (`reason` in words); `InputError` is wrong input. Differentiable by model
     and data through the condition of the minimum, and mapped by `jax.vmap`; bounded fits are not differentiable.

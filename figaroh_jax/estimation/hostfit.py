@@ -2,7 +2,8 @@ r"""Least squares of which rows and Jacobian are one program and the steps are S
 
 A solver inside of a program puts the rows into it several times (to step, to end, for the covariance), and long rows,
 as those of a simulation, then take a minute to compile. Here they are compiled once. SciPy's trust region reflective
-method steps by the SVD of the Jacobian, on columns scaled to one length, so that nothing squares its condition number; near the minimum Gauss and Newton's whole steps follow, for which no cost need fall.
+method steps by the SVD of the Jacobian, on columns scaled to one length, so that nothing squares its condition number;
+near the minimum whole steps of Gauss and Newton follow, which go on where a cost can no longer tell two points apart.
 """
 
 from __future__ import annotations
