@@ -9,7 +9,7 @@ near the minimum whole steps of Gauss and Newton follow, which go on where a cos
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -67,16 +67,9 @@ def descend(
     def bound(z: np.ndarray) -> np.ndarray:
         return np.concatenate([seen(z - 1.0)[0], ridge * (z - 1.0)])
 
-    found = least_squares(
-        bound,
-        start + 1.0,  # the first steps may be as long as the numbers of the start: as their sizes, which are 1
-        lambda z: np.concatenate([seen(z - 1.0)[1], np.diag(ridge)]),
-        x_scale="jac",
-        ftol=_COST,
-        xtol=_TOLERANCE,
-        gtol=None,
-        max_nfev=max_steps + 1,
-    )
+    settings: Any = {"x_scale": "jac", "ftol": _COST, "xtol": _TOLERANCE, "gtol": None, "max_nfev": max_steps + 1}
+    settings["jac"] = lambda z: np.concatenate([seen(z - 1.0)[1], np.diag(ridge)])
+    found = least_squares(bound, start + 1.0, **settings)  # the first steps may be as long as the sizes, which are 1
     at, steps = found.x - 1.0, found.nfev - 1
     rows, jacobian = seen(at)
     step, promised = _whole_step(rows, jacobian)
