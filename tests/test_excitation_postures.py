@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 from pathlib import Path
 from typing import Literal
 
@@ -13,11 +14,15 @@ import reference
 import robots
 
 from figaroh_jax.cli import main
+from figaroh_jax.effects.extended import extend
 from figaroh_jax.errors import InputError
 from figaroh_jax.excitation import postures
 from figaroh_jax.excitation.clearance import Capsule, clearance_of
 from figaroh_jax.excitation.postures import Instrument, View, excite_postures
+from figaroh_jax.excitation.task import excite_task
 from figaroh_jax.excitation.touch import Touch
+from figaroh_jax.formats.config import load_task
+from figaroh_jax.formats.export import model_files
 from figaroh_jax.rigid.model import RobotModel
 
 LIMIT = '<limit lower="-2" upper="2" velocity="3" effort="40"/>'
@@ -145,6 +150,32 @@ def test_the_command_writes_postures_with_their_share_of_the_bound(tmp_path: Pat
     assert "certified" in (tmp_path / "run" / "report.html").read_text()
 
 
+@pytest.mark.parametrize("form", ["urdf", "xml"])
+def test_postures_are_chosen_for_a_robot_with_moments_that_no_body_can_have(tmp_path: Path, form: str):
+    """The postures are those of the same robot with other moments; a motion, whose torques they make, is refused."""
+    wrong, sound = tmp_path / f"wrong.{form}", tmp_path / f"sound.{form}"
+    model = robots.load(WRIST, tmp_path)
+    sound.write_text(WRIST if form == "urdf" else model_files(extend(model))["robot.xml"])
+    where, numbers = ("link", "-9") if form == "urdf" else ("body", "-9 1 1 0 0 0")
+    until = rf'(<{where} name="b".*?(ixx|fullinertia)=")[^"]*'
+    wrong.write_text(re.sub(until, rf"\g<1>{numbers}", sound.read_text(), count=1, flags=re.DOTALL))
+    limits = "limits: {clearance: 0.01}, floor: -5, bodies: [{link: c, at: [0, 0, 0], radius: 0.01}]"
+    device = (
+        f"{limits}, measurement: {{pose: pose, base_frame: base, tool_frame: c, unknown: [base_frame, tool_frame]}}"
+    )
+    found = []
+    for file in (sound, wrong):
+        block = f"{{kind: postures, postures: 10, candidates: 30, {device}}}"
+        (tmp_path / "task.yaml").write_text(f"robot: {{model: {file.name}}}\nexcite: {block}\n")
+        found.append(excite_task(load_task(tmp_path / "task.yaml")))
+    np.testing.assert_allclose(found[1].position, found[0].position, rtol=0, atol=1e-12)
+    (note,) = set(found[1].notes) - set(found[0].notes)
+    assert note.startswith(f"wrong.{form}: link 'b': its inertia has a negative principal moment, -9")
+    (tmp_path / "task.yaml").write_text(f"robot: {{model: {wrong.name}}}\nexcite: {{duration: 2}}\n")
+    with pytest.raises(InputError, match="negative principal moment" if form == "urdf" else "does not compile it"):
+        excite_task(load_task(tmp_path / "task.yaml"))
+
+
 @pytest.mark.parametrize(
     ("block", "message"),
     [
@@ -159,9 +190,6 @@ def test_the_command_writes_postures_with_their_share_of_the_bound(tmp_path: Pat
     ],
 )
 def test_what_cannot_be_chosen_is_one_message(tmp_path: Path, block: str, message: str):
-    from figaroh_jax.excitation.task import excite_task
-    from figaroh_jax.formats.config import load_task
-
     (tmp_path / "robot.urdf").write_text(WRIST)
     (tmp_path / "task.yaml").write_text(f"robot: {{model: robot.urdf}}\nexcite: {block}\n")
     with pytest.raises(InputError, match=message):

@@ -19,9 +19,10 @@ from figaroh_jax.errors import InputError
 from figaroh_jax.formats.config import load_task
 from figaroh_jax.formats.export import load_model, write_model
 from figaroh_jax.formats.mjcf import compiled_robot, load_mjcf
-from figaroh_jax.formats.robotfile import load_extended, load_robot, read_robot, stated_baseline
+from figaroh_jax.formats.robotfile import impossible_said, load_extended, load_robot, read_robot, stated_baseline
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.rigid.dynamics import inverse_dynamics, mass_matrix
+from figaroh_jax.rigid.inertia import to_com
 from figaroh_jax.rigid.kinematics import forward_kinematics
 from figaroh_jax.rigid.model import RobotModel
 
@@ -224,6 +225,44 @@ def test_a_joint_held_by_an_equality_does_not_move(tmp_path: Path) -> None:
     assert model.joint_names == ("shoulder", "elbow", "left")
     frame = model.frames.index(next(f for f in model.frames if f.name == "right"))
     np.testing.assert_allclose(model.frame_placement[frame][:3, 3], [0, -0.03 - 0.015, 0.3], rtol=0, atol=1e-15)
+
+
+IMPOSSIBLE = {  # what MuJoCo refuses: its own words, our note, the moments about the centre of mass
+    "negative": ('diaginertia="-.1 .1 .2"', "A [+] B >= C", "negative principal moment, -0.1", [-0.1, 0.1, 0.2]),
+    "nothing": ('diaginertia="0 0 0"', "larger than mjMINVAL", "", [0.0, 0.0, 0.0]),
+    "sums": ('diaginertia=".1 .1 .5"', "A [+] B >= C", "moments 0.1, 0.1 and 0.5 kg m", [0.1, 0.1, 0.5]),
+    "full": ('fullinertia=".1 .1 .2 .3 0 0"', "positive eigenvalues", "negative principal moment, -0.2 kg m", None),
+}
+
+
+@pytest.mark.parametrize("name", IMPOSSIBLE)
+def test_moments_that_mujoco_refuses_pass_for_postures_alone(name: str, tmp_path: Path) -> None:
+    """Poses are MuJoCo's of the same file with moments that it takes; the link keeps the numbers of the file."""
+    attribute, refused, told, moments = IMPOSSIBLE[name]
+    about = np.diag(moments) if moments else np.array([[0.1, 0.3, 0], [0.3, 0.1, 0], [0, 0, 0.2]])
+    text = (
+        '<mujoco><worldbody><body name="a" pos="0 0 .2"><joint name="j" axis="0 0 1"/><inertial pos="0 0 0" mass="1"'
+        ' diaginertia=".1 .1 .1"/><body name="b" pos=".3 0 0" euler="20 30 0"><joint name="k" axis="0 1 0"/><inertial'
+        ' pos=".1 0 0" mass="2" {}/><site name="tip" pos=".1 .2 .3"/></body></body></worldbody></mujoco>'
+    )
+    (tmp_path / "sound.xml").write_text(text.format('diaginertia=".1 .1 .1"'))
+    path = written(text.format(attribute), tmp_path)
+    with pytest.raises(InputError, match=refused):
+        load_mjcf(path)
+    notes = impossible_said(path)  # none of zero moments, those of a point
+    assert len(notes) == bool(told) and all(told in note and "robot.xml: link 'b': its" in note for note in notes)
+    assert impossible_said(tmp_path / "sound.xml") == ()
+    model = load_mjcf(path, kinematic=True)
+    mass, com, got = to_com(np.asarray(model.inertia[1]))
+    np.testing.assert_allclose([mass, *com], [2, 0.1, 0, 0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(got, about, rtol=0, atol=1e-12)
+    mj = mujoco.MjModel.from_xml_path(str(tmp_path / "sound.xml"))
+    data, q = mujoco.MjData(mj), np.array([0.4, -1.1])
+    data.qpos[:] = q
+    mujoco.mj_kinematics(mj, data)
+    pose = fj.frame_placement(model, q, "tip")
+    np.testing.assert_allclose(pose[:3, 3], data.site("tip").xpos, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(pose[:3, :3].ravel(), data.site("tip").xmat, rtol=0, atol=1e-12)
 
 
 def test_files_that_mujoco_does_not_take_are_refused(tmp_path: Path) -> None:

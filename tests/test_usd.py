@@ -17,9 +17,9 @@ import robots
 
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.config import load_task
-from figaroh_jax.formats.robotfile import load_extended, load_robot, read_robot
+from figaroh_jax.formats.robotfile import impossible_said, load_extended, load_robot, read_robot
 from figaroh_jax.formats.usd import load_usd
-from figaroh_jax.rigid import dynamics
+from figaroh_jax.rigid import dynamics, kinematics
 from figaroh_jax.rollouts.reading import load_loop
 
 pytest.importorskip("pxr", reason="usd-core is not installed (the extra `usd`)")
@@ -198,6 +198,23 @@ TIE = joint("tie", "Revolute", ("a", "b"), "    uniform bool physics:excludeFrom
 ROPE, APART = joint("rope", "Distance", ("a", "b")), joint("cb", "Prismatic", ("c", "b"))
 ODD = joint("odd", "", ("base", "a"), *locked("transX", "rotX"))
 LIMITS = joint("ja", "Prismatic", ("base", "a"), "    float physics:lowerLimit = 1\n    float physics:upperLimit = 0")
+
+
+def test_a_negative_moment_passes_for_postures_alone(tmp_path: Path) -> None:
+    """Torques had taken it in silence; poses are those of the stage with moments that a body can have."""
+    hinge = joint("swing", "Revolute", ("base", "bob"), SWING)
+    sound = load_usd(stage(tmp_path, body("base"), body("bob"), hinge, HELD, head=CENTIMETRES))
+    wrong = body("bob", moments="(-2000, 3000, 4000)")
+    path = stage(tmp_path, body("base"), wrong, hinge, HELD, head=CENTIMETRES)
+    with pytest.raises(
+        InputError, match="robot.usda: link 'bob': its inertia has a negative principal moment, -0.0002"
+    ):
+        load_usd(path)
+    (note,) = impossible_said(path)
+    assert note.startswith("robot.usda: link 'bob': its inertia has a negative")
+    q = np.array([[0.7], [-0.4]])
+    poses = [kinematics.forward_kinematics(model, q) for model in (sound, load_usd(path, kinematic=True))]
+    np.testing.assert_allclose(poses[1], poses[0], rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from ..errors import InputError, check_kind
 from ..formats.collision import read_shapes
 from ..formats.config import Task, robot_options
 from ..formats.excite_keys import Excite, Sight, SizedEffect
-from ..formats.robotfile import load_extended, load_robot, stated_baseline
+from ..formats.robotfile import impossible_said, load_extended, load_robot, stated_baseline
 from ..recordings.reading import read_table
 from ..rigid.model import RobotModel
 from .clearance import Box, Capsule, Clearance, clearance_of
@@ -62,7 +62,7 @@ def excite_task(
         raise InputError(
             f"{task.file}: no `excite` block: it says what is to be designed, as in excite: {{duration: 10}}"
         )
-    robot = load_robot(task)
+    robot = load_robot(task, kinematic=asked.kind == "postures")
     if asked.kind == "postures":
         return _postures(task, asked, robot, progress)
     model, (known, notes) = load_extended(task.robot.model, **robot_options(task.robot)).model, stated_baseline(task)
@@ -189,6 +189,7 @@ def _postures(task: Task, asked: Excite, robot: RobotModel, progress: Callable[[
         clearance=clearance,
         progress=progress,
     )
+    said = (*impossible_said(task.robot.model), *said)
     if asked.view is None and not asked.touch:
         said = (*said, "no view is given: what the device can see from its place is not looked at")
     if place is None:

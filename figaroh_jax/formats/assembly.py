@@ -37,6 +37,7 @@ Posture = Mapping[str, float | Sequence[float]]  # a number for a revolute or pr
 Root = Literal["fixed", "free_flyer"]
 
 MOST_PARTS = 2000  # links or joints of a robot
+_ROUNDED = 1e-6  # kg m^2; the inertias of small parts are often rounded to nonsense below this
 LARGEST_NUMBER = 1e9  # m, kg, kg m^2, ...: beyond it no robot is described, and products overflow
 
 ROOT_JOINT = "root_joint"  # the free joint between the world and the root link of a free flyer
@@ -48,6 +49,7 @@ class LinkPart(NamedTuple):
 
     name: str
     inertia: Float[np.ndarray, "10"]  # at and in the link's frame
+    wrong: str = ""  # what no body can have of its moments of inertia; empty: nothing
 
 
 class JointPart(NamedTuple):
@@ -97,6 +99,8 @@ def assemble(
     gravity: Sequence[float] = (0.0, 0.0, -9.81),
     root: Root = "fixed",
     frames: Sequence[FramePart] = (),
+    *,
+    kinematic: bool = False,
 ) -> RobotModel:
     """Model of the robot `name` whose links and joints are `parts`.
 
@@ -104,22 +108,49 @@ def assemble(
     says nothing; for a spherical, planar or free joint its numbers in q). Without `joints`, all joints move but those
     that `posture` names, in tree order. The root link is fixed to the world, or moves freely against it
     (`free_flyer`): then the free joint `root_joint` takes the first columns. Raises `InputError`, prefixed by
-    `source`, for parts that are not one tree and for names that do not exist.
+    `source`, for parts that are not one tree, for names that do not exist, and, unless the model is for postures alone
+    (`kinematic`), for moments of inertia that no body can have.
     """
     try:
         for what, some in zip(("links", "joints"), parts, strict=True):
             refuse_many("", what, len(some))
+        if not kinematic and (wrong := impossible_links(parts[0])):
+            raise InputError(wrong[0])
         parts, joints = _rooted(root, parts, joints)
         base, children = _tree(*parts)
         drives = _drives(parts[1])
         locked = _locked(drives, [j.name for j in parts[1] if j.kind == "fixed"], joints, posture or {})
-        build = _Build(dict(parts[0]), children, drives, locked)
+        build = _Build({link.name: link.inertia for link in parts[0]}, children, drives, locked)
         with np.errstate(over="ignore", invalid="ignore"):  # the model's numbers are checked when it is whole
             build.grow(base)
             build.mark(frames)
             return _sound(build.finish(name, joints, _gravity(gravity)))
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
+
+
+def impossible_links(links: Sequence[LinkPart]) -> tuple[str, ...]:
+    """A line on each of the links whose moments of inertia no body can have."""
+    return tuple(f"link '{link.name}': {link.wrong}" for link in links if link.wrong)
+
+
+def wrong_moments(moments: Float[np.ndarray, "3 3"], *, sums: bool = False) -> str:
+    """What no body can have of moments about its centre of mass (kg m^2); empty: nothing.
+
+    `sums`: the largest principal moment above the two others together is wrong too, which few writers of URDF mind.
+    """
+    if not np.isfinite(moments).all():
+        return ""  # `assemble` refuses it
+    least, middle, most = np.linalg.eigvalsh(moments)
+    little = _ROUNDED * max(1.0, most)
+    if least < -little:
+        return f"its inertia has a negative principal moment, {least:.3g} kg m^2"
+    if sums and least + middle < most - little:
+        return (
+            f"its inertia has the principal moments {least:.3g}, {middle:.3g} and {most:.3g} kg m^2, the last more"
+            " than the others together"
+        )
+    return ""
 
 
 def welded_bodies(robot: RobotModel, parts: tuple[Sequence[LinkPart], Sequence[JointPart]]) -> tuple[Welded, ...]:

@@ -170,9 +170,9 @@ def _mesh(file: Path) -> tuple[np.ndarray, np.ndarray] | str:
 def _of_mjcf(path: Path) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
     mujoco, notes = engine(), []
     try:
-        mj = mujoco.MjModel.from_xml_path(str(path))
-    except Exception:  # meshes are missing, most often
-        mj = compile_mjcf(path)
+        mj = compile_mjcf(path, kinematic=True, looks=True)
+    except InputError:  # meshes are missing, most often
+        mj = compile_mjcf(path, kinematic=True)
         notes.append(f"{path}: its meshes cannot be read; shapes that need them are left out")
     kinds: dict[int, Kind] = {
         int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",

@@ -28,6 +28,7 @@ from .assembly import (
     displacement,
     refuse_many,
     translation,
+    wrong_moments,
 )
 from .xmlfile import find_in_packages, read_xml
 
@@ -67,13 +68,16 @@ def load_mjcf(
     gravity: Sequence[float] | None = None,
     root: Root | None = None,
     packages: Sequence[str | Path] = (),
+    *,
+    kinematic: bool = False,
 ) -> RobotModel:
     """Model of the robot in an MJCF file; needs MuJoCo, which a user of MJCF has.
 
-    `joints`, `posture` and `packages` as in `load_urdf`; locked joints stand at the file's own `qpos0` where `posture`
-    says nothing. `gravity` (m/s^2) is the file's where it is None. `root` None takes the base as the file has it;
-    `fixed` locks the free joints of the file; `free_flyer` frees a base that the file welds to the world. Free joints
-    that are not locked stand in front of `joints` where it does not name them.
+    `joints`, `posture`, `packages` and `kinematic` as in `load_urdf`: for postures alone, moments that MuJoCo refuses
+    pass. Locked joints stand at the file's own `qpos0` where `posture` says nothing. `gravity` (m/s^2) is the file's
+    where it is None. `root` None takes the base as the file has it; `fixed` locks the free joints of the file;
+    `free_flyer` frees a base that the file welds to the world. Free joints that are not locked stand in front of
+    `joints` where it does not name them.
 
     Bodies are links, welded bodies are merged into what carries them, and every body, joint and site is a frame. A body
     with several joints is a chain of them with massless links between. Positions are MuJoCo's `qpos` (a `ref` is in
@@ -92,11 +96,15 @@ def load_mjcf(
     ('waist', 'shoulder', 'elbow', 'wrist')
     """
     path = find_in_packages(path, packages)
-    return compiled_robot(str(path), compile_mjcf(path), joints, posture, gravity, root)
+    mj = compile_mjcf(path, kinematic=kinematic)
+    return compiled_robot(str(path), mj, joints, posture, gravity, root, kinematic=kinematic)
 
 
-def compile_mjcf(path: str | Path) -> Any:
-    """The compiled `mujoco.MjModel`, without meshes, textures and sensors that say nothing about the dynamics."""
+def compile_mjcf(path: str | Path, *, kinematic: bool = False, looks: bool = False) -> Any:
+    """The compiled `mujoco.MjModel`, without meshes, textures and sensors that say nothing about the dynamics.
+
+    `looks` keeps those. `kinematic`: moments of inertia that MuJoCo refuses are in the model as the file has them.
+    """
     mujoco = engine()
     _check_counts(Path(path), read_xml(path, "mujoco"))
     try:
@@ -104,8 +112,14 @@ def compile_mjcf(path: str | Path) -> Any:
             spec = mujoco.MjSpec.from_file(str(path))
         if spec.flexes:
             raise InputError(f"{path}: has a flex, '{spec.flexes[0].name}'; a robot here is a tree of rigid bodies")
-        _drop_looks(mujoco, spec)
-        return spec.compile()
+        if not looks:
+            _drop_looks(mujoco, spec)
+        aside = _set_aside(mujoco, spec) if kinematic else []
+        mj = spec.compile()
+        for body, principal, axes in aside:
+            mj.body_inertia[body.id] = principal
+            mj.body_iquat[body.id] = mj.body_iquat[body.id] if axes is None else axes
+        return mj
     except InputError:
         raise
     except Exception as error:  # MuJoCo's own kinds, and what its Python layer makes of bytes that are no UTF-8
@@ -196,6 +210,30 @@ def _drop_looks(mujoco: Any, spec: Any) -> None:
             spec.delete(element)
 
 
+def _set_aside(mujoco: Any, spec: Any) -> list[tuple[Any, np.ndarray, np.ndarray | None]]:
+    """Give bodies whose moments the compiler refuses others: each with its principal moments (kg m^2) and their axes.
+
+    The axes are a quaternion (w x y z); None where the spec keeps them. Postures ask for neither.
+    """
+    found, compiler = [], spec.compiler
+    if compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        return []
+    for body, _ in _bodies(spec):
+        if not body.explicitinertial:
+            continue
+        principal, axes, bound = np.array(body.inertia), None, compiler.boundinertia
+        if not np.isnan(body.fullinertia[0]):
+            xx, yy, zz, xy, xz, yz = body.fullinertia
+            principal, turn = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            axes, bound = np.zeros(4), 0.0  # its eigenvalues are asked for before the bound
+            mujoco.mju_mat2Quat(axes, (turn * np.linalg.det(turn)).ravel())
+        least, middle, most = np.sort(np.maximum(principal, bound))
+        if least < mujoco.mjMINVAL or (least + middle < most and not compiler.balanceinertia):
+            body.fullinertia, body.inertia = np.full(6, np.nan), np.ones(3)
+            found.append((body, principal, axes))
+    return found
+
+
 def _bodies(spec: Any) -> Iterator[tuple[Any, bool]]:
     """Every body and whether it moves."""
     stack = [(spec.worldbody, False)]
@@ -212,6 +250,8 @@ def compiled_robot(
     posture: Posture | None = None,
     gravity: Sequence[float] | None = None,
     root: Root | None = None,
+    *,
+    kinematic: bool = False,
 ) -> RobotModel:
     """Model of a compiled `mujoco.MjModel`; `source` names it in messages. See `load_mjcf`."""
     check_names("joints", joints)
@@ -230,9 +270,8 @@ def compiled_robot(
         joints = [*(name for name in free if name not in joints and name not in posture), *joints]
     own = [0.0, 0.0, 0.0] if disabled(mj, "GRAVITY") else mj.opt.gravity.tolist()
     name = mj.names[: mj.names.index(b"\0")].decode() or Path(source).stem
-    model = assemble(
-        source, name, (links, parts), joints, posture, own if gravity is None else gravity, "fixed", frames
-    )
+    down = own if gravity is None else gravity
+    model = assemble(source, name, (links, parts), joints, posture, down, "fixed", frames, kinematic=kinematic)
     _refuse_loops(source, mj, model)
     return model
 
@@ -296,11 +335,11 @@ def mjcf_parts(mj: Any, root: Root | None) -> tuple[list[LinkPart], list[JointPa
                 name = _unused(f"{name}_fixed", [*names, *bodies])
             joints.append(JointPart(name, "fixed", carrier, bodies[b], pose, np.zeros(3)))
             pose = np.eye(4)
+        moments = np.diag(mj.body_inertia[b])
         about_body = inertia.transform(
-            inertia.from_com(mj.body_mass[b], np.zeros(3), np.diag(mj.body_inertia[b])),
-            _pose(mj.body_ipos[b], mj.body_iquat[b]),
+            inertia.from_com(mj.body_mass[b], np.zeros(3), moments), _pose(mj.body_ipos[b], mj.body_iquat[b])
         )
-        links.append(LinkPart(bodies[b], inertia.transform(about_body, pose)))
+        links.append(LinkPart(bodies[b], inertia.transform(about_body, pose), wrong_moments(moments, sums=True)))
         offset.append(pose)
         if not np.array_equal(pose, np.eye(4)):
             frames.append(FramePart(bodies[b], bodies[b], pose))

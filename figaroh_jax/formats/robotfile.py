@@ -18,7 +18,7 @@ from ..effects.catalogue import find
 from ..effects.extended import ExtendedModel, extend
 from ..errors import InputError, check_kind
 from ..rigid.model import RobotModel
-from .assembly import LARGEST_NUMBER, Posture, Root, Welded, welded_bodies
+from .assembly import LARGEST_NUMBER, JointPart, LinkPart, Posture, Root, Welded, impossible_links, welded_bodies
 from .compensation import GravityCompensation
 from .files import model_format
 from .mjcf import (
@@ -33,7 +33,7 @@ from .mjcf import (
     mjcf_parts,
 )
 from .native import place_names
-from .urdf import impossible_moments, load_urdf, said_twice, urdf_dynamics, urdf_parts
+from .urdf import load_urdf, said_twice, urdf_dynamics, urdf_parts
 from .usd import load_usd, usd_joints, usd_parts
 from .xmlfile import find_in_packages
 
@@ -63,13 +63,14 @@ def read_robot(
     """Rigid bodies of the robot in a `.urdf`, `.xml` (MJCF) or `.usd` file: `load_urdf`, `load_mjcf`, `load_usd`.
 
     `gravity` and `root` None: as the file has them, which for URDF is (0, 0, -9.81) and a fixed root. `kinematic` as
-    in `load_urdf`; the others refuse impossible inertias anyway. Raises `InputError` for other files, and as those do.
+    in `load_urdf`. Raises `InputError` for other files, and as those do.
     """
     form = model_format(path)
     if form == "urdf":
         down = (0.0, 0.0, -9.81) if gravity is None else gravity
         return load_urdf(path, joints, posture, down, root or "fixed", packages, kinematic=kinematic)
-    return (load_usd if form == "usd" else load_mjcf)(path, joints, posture, gravity, root, packages)
+    load = load_usd if form == "usd" else load_mjcf
+    return load(path, joints, posture, gravity, root, packages, kinematic=kinematic)
 
 
 def load_extended(
@@ -154,21 +155,25 @@ def impossible_said(path: str | Path, packages: Sequence[str | Path] = ()) -> tu
     Postures ask for none: the weight of a link, which bends compliant joints, takes mass and centre of mass alone.
     """
     urdf = model_format(path) == "urdf"
-    lines = impossible_moments(find_in_packages(path, packages)) if urdf else ()
     return tuple(
         f"{Path(path).name}: {line}, which no body can have; postures do not depend on it (a link's weight takes mass"
-        " and centre of mass alone). A calibration's robot.urdf keeps it, its robot.xml has the nearest that a body can"
-        " have; tasks of torques refuse the file"
-        for line in lines
+        f" and centre of mass alone). A calibration's {'robot.urdf keeps it, its ' * urdf}robot.xml has the nearest"
+        " that a body can have; tasks of torques refuse the file"
+        for line in impossible_links(_parts(find_in_packages(path, packages))[0])
     )
 
 
 def welded_to(robot: RobotModel, path: str | Path, root: Root | None = None) -> tuple[Welded, ...]:
     """What the file of a robot fixes to its moving links: hands, cameras, covers. Arguments as in `read_robot`."""
-    file, form = find_in_packages(path, ()), model_format(path)
+    return welded_bodies(robot, _parts(find_in_packages(path, ()), root))
+
+
+def _parts(file: Path, root: Root | None = None) -> tuple[Sequence[LinkPart], Sequence[JointPart]]:
+    """Links and joints that the file of a robot names."""
+    form = model_format(file)
     if form == "urdf":
-        return welded_bodies(robot, urdf_parts(file)[1])
-    return welded_bodies(robot, usd_parts(file, root) if form == "usd" else mjcf_parts(compile_mjcf(file), root)[:2])
+        return urdf_parts(file)[1]
+    return usd_parts(file, root) if form == "usd" else mjcf_parts(compile_mjcf(file, kinematic=True), root)[:2]
 
 
 def stated_baseline(task: Task) -> tuple[Baseline, tuple[str, ...]]:

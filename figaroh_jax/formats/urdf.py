@@ -16,7 +16,7 @@ from jaxtyping import Float
 from ..errors import InputError, check_names, nearest
 from ..rigid import inertia
 from ..rigid.model import Kind, RobotModel
-from .assembly import JointPart, LinkPart, Posture, Root, assemble, refuse_many
+from .assembly import JointPart, LinkPart, Posture, Root, assemble, refuse_many, wrong_moments
 from .xmlfile import find_in_packages, read_xml
 
 __all__ = ["load_urdf", "said_twice", "urdf_dynamics", "urdf_parts"]
@@ -54,7 +54,6 @@ _FIRST = {  # of these the first counts, as in urdfdom
     "link": ("inertial",),
     "joint": ("origin", "parent", "child", "axis", "limit", "mimic", "dynamics"),
 }
-_ROUNDED = 1e-6  # kg m^2; the inertias of small parts are often rounded to nonsense below this
 
 
 def load_urdf(
@@ -90,16 +89,16 @@ def load_urdf(
     """
     check_names("joints", joints)
     path = find_in_packages(path, packages)
-    name, parts = urdf_parts(path, kinematic=kinematic)
-    return assemble(str(path), name, parts, joints, posture, gravity, root)
+    name, parts = urdf_parts(path)
+    return assemble(str(path), name, parts, joints, posture, gravity, root, kinematic=kinematic)
 
 
-def urdf_parts(path: str | Path, *, kinematic: bool = False) -> tuple[str, tuple[list[LinkPart], list[JointPart]]]:
-    """Name of the robot in a URDF file, its links and its joints; `kinematic` as in `load_urdf`."""
+def urdf_parts(path: str | Path) -> tuple[str, tuple[list[LinkPart], list[JointPart]]]:
+    """Name of the robot in a URDF file, its links and its joints."""
     robot = _read(path)
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # `assemble` checks what comes of it
-            links = [_link(link, kinematic) for link in robot.iterchildren("link")]
+            links = [_link(link) for link in robot.iterchildren("link")]
             joints = [_joint(joint) for joint in robot.iterchildren("joint")]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -120,11 +119,6 @@ def urdf_dynamics(path: str | Path) -> dict[str, tuple[float, float]]:
                     )
             found[joint.get("name")] = (float(element.get("damping", 0)), float(element.get("friction", 0)))
     return found
-
-
-def impossible_moments(path: str | Path) -> tuple[str, ...]:
-    """The links of the file whose moments of inertia no body can have, a line on each."""
-    return tuple(filter(None, (_negative_moment(link) for link in _read(path).iterchildren("link"))))
 
 
 def said_twice(path: str | Path) -> tuple[str, ...]:
@@ -209,33 +203,22 @@ def _check_numbers(element: Any, attribute: str, count: int, where: str) -> None
         raise InputError(f"{place} is '{text}'; finite numbers are expected")
 
 
-def _link(link: Any, kinematic: bool) -> LinkPart:
+def _link(link: Any) -> LinkPart:
     name, inertial = str(link.get("name")), link.find("inertial")
     if inertial is None:
         return LinkPart(name, np.zeros(10))
     mass = float(inertial.find("mass").get("value"))
     if mass < 0.0:
         raise InputError(f"link '{name}': its mass is {mass:g} kg; it cannot be negative")
-    if not kinematic and (wrong := _negative_moment(link)):
-        raise InputError(wrong)
-    about_com = inertia.from_com(mass, np.zeros(3), _moments(inertial))
-    return LinkPart(name, inertia.transform(about_com, _origin(inertial)))
+    moments = _moments(inertial)
+    about_com = inertia.from_com(mass, np.zeros(3), moments)
+    return LinkPart(name, inertia.transform(about_com, _origin(inertial)), wrong_moments(moments))
 
 
 def _moments(inertial: Any) -> np.ndarray:
     """Inertia (3, 3) about the centre of mass, kg m^2."""
     moments = {key: float(value) for key, value in inertial.find("inertia").attrib.items() if key in _MOMENTS}
     return np.array([[moments[key] for key in row.split()] for row in _ROWS])
-
-
-def _negative_moment(link: Any) -> str:
-    """What no body can have of the moments of a link; empty: nothing."""
-    if (inertial := link.find("inertial")) is None:
-        return ""
-    principal = np.linalg.eigvalsh(_moments(inertial))
-    if principal[0] >= -_ROUNDED * max(1.0, principal[-1]):
-        return ""
-    return f"link '{link.get('name')}': its inertia has a negative principal moment, {principal[0]:.3g} kg m^2"
 
 
 def _joint(joint: Any) -> JointPart:

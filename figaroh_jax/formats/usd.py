@@ -17,7 +17,18 @@ from jaxtyping import Float
 from ..errors import InputError, check_names
 from ..rigid import inertia
 from ..rigid.model import RobotModel
-from .assembly import ROOT_JOINT, FramePart, JointPart, LinkPart, Posture, Root, assemble, displacement, translation
+from .assembly import (
+    ROOT_JOINT,
+    FramePart,
+    JointPart,
+    LinkPart,
+    Posture,
+    Root,
+    assemble,
+    displacement,
+    translation,
+    wrong_moments,
+)
 from .usd_stage import DEGREE, ROTATIONS, TRANSLATIONS, Edge, Stage, body_inertia, name_of, reading, schemas, value
 from .xmlfile import find_in_packages
 
@@ -42,13 +53,15 @@ def load_usd(
     gravity: Sequence[float] | None = None,
     root: Root | None = None,
     packages: Sequence[str | Path] = (),
+    *,
+    kinematic: bool = False,
 ) -> RobotModel:
     """Model of the robot in an OpenUSD stage (`.usd`, `.usda`, `.usdc`, `.usdz`); needs `usd-core`.
 
-    `joints`, `posture` and `packages` as in `load_urdf`. `gravity` (m/s^2) is that of the stage's physics scene where
-    it is None, and 9.81 against the up axis where there is no scene. `root` None takes the base as the stage has it: a
-    tree without a joint to the world moves freely. `fixed` holds it where it stands, `free_flyer` frees a base that a
-    fixed joint holds.
+    `joints`, `posture`, `packages` and `kinematic` as in `load_urdf`. `gravity` (m/s^2) is that of the stage's physics
+    scene where it is None, and 9.81 against the up axis where there is no scene. `root` None takes the base as the
+    stage has it: a tree without a joint to the world moves freely. `fixed` holds it where it stands, `free_flyer` frees
+    a base that a fixed joint holds.
 
     A rigid body is a link; a revolute, prismatic, spherical or fixed joint is one of the model, and so is a generic
     joint whose limits leave one axis, three rotations or all six free. The zero of a joint is where its two frames
@@ -57,7 +70,7 @@ def load_usd(
     controller's and no part of the robot; its greatest force is the effort limit.
 
     Raises `InputError` for a stage that does not open, and, with the names of the joints or bodies, for what is no
-    tree: loops, two robots in one stage, joints that do not hold their axes.
+    tree: loops, two robots in one stage, joints that do not hold their axes; for moments that no body can have.
 
     >>> import pathlib, tempfile, figaroh_jax as fj
     >>> has = 'prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI"]'
@@ -77,7 +90,7 @@ def load_usd(
         own = stage.gravity() if gravity is None else gravity
     if free and joints is not None and free not in joints:
         joints = [free, *joints]
-    return assemble(str(file), stage.name, (links, parts), joints, posture, own, "fixed", frames)
+    return assemble(str(file), stage.name, (links, parts), joints, posture, own, "fixed", frames, kinematic=kinematic)
 
 
 def usd_parts(
@@ -115,7 +128,7 @@ def _parts(stage: Stage, root: Root | None) -> tuple[list[LinkPart], list[JointP
     names = {path: stage.bodies[path].name for path in inside}
     names[""] = "world" if "world" not in names.values() else "world_of_the_stage"
     start, edges = _start(stage, base, edges, root, names)
-    links = [LinkPart(names[path], inertia.transform(body_inertia(stage, path), offset[path])) for path in inside]
+    links = [_link(names[path], body_inertia(stage, path), offset[path]) for path in inside]
     parts, inner = _joints(stage, edges, names, offset)
     frames = [
         FramePart(names[path], names[path], offset[path])
@@ -130,6 +143,10 @@ def _parts(stage: Stage, root: Root | None) -> tuple[list[LinkPart], list[JointP
         frames.append(FramePart(stage.bodies[path].name, names[""], offset[path]))
     frames += _frames(stage, names, offset)
     return [*links, *inner], [*start, *parts], frames, start[0].name if start and start[0].kind == "free" else ""
+
+
+def _link(name: str, ten: Float[np.ndarray, "10"], pose: Float[np.ndarray, "4 4"]) -> LinkPart:
+    return LinkPart(name, inertia.transform(ten, pose), wrong_moments(inertia.to_com(ten)[2]) if ten[0] > 0 else "")
 
 
 def _start(

@@ -142,7 +142,7 @@ def designed(folder: Path) -> Played:
     except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile):
         raise InputError(f"{folder}: the design cannot be read; name a run directory of `excite`") from None
     task = load_task(Path(read_provenance(folder)["task"]))
-    robot = load_robot(task)
+    robot = load_robot(task, kinematic=True)
     if list(robot.dof_names) != joints:
         raise InputError(f"{folder}: made for the joints {', '.join(joints)}; {task.file} has others now")
     asked = task.excite if still and task.excite is not None else excite_block(task.excite)
