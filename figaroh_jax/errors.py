@@ -43,7 +43,7 @@ def check_real(name: str, array: Any) -> None:
         held = {"c": "complex numbers", "U": "text", "S": "bytes", "O": "objects", "R": "records"}.get(
             kind, f"data of kind '{kind}'"
         )
-        raise InputError(f"{name} holds {held}; real ones are expected")
+        raise InputError(f"{name} holds {held}; real numbers are expected")
 
 
 @contextmanager
@@ -98,18 +98,45 @@ def check_path(name: str, given: Any) -> None:
         raise InputError(f"{name} is {None if given is None else f'of type {kind}'}; the path of a file is expected")
 
 
-def check_positive(name: str, given: Any, unit: str) -> None:
-    """Refuse all but one finite number above zero; what JAX traces passes."""
+def check_finite(name: str, array: Any, least: float = -math.inf) -> None:
+    """Refuse all but real, finite numbers of `least` or more; what JAX traces passes."""
+    check_real(name, array)
+    import numpy as np
+
+    try:
+        values = np.asarray(array, float)
+    except Exception as error:
+        if type(error).__module__.partition(".")[0] != "jax":
+            raise
+        return
+    wrong = ~(np.isfinite(values) & (values >= least))
+    if wrong.any():
+        bound = f" of {least:g} or more" * math.isfinite(least)
+        told = "holds" if values.ndim else "is"
+        raise InputError(f"{name} {told} {values[wrong].flat[0]:g}; finite numbers{bound} are expected")
+
+
+def check_count(name: str, given: Any, least: int = 1) -> None:
+    """Refuse all but one whole number of `least` or more."""
+    if isinstance(given, bool) or not hasattr(given, "__index__") or given.__index__() < least:
+        told = f"the text '{given[:100]}'" if isinstance(given, str) else f"{given!r:.100}"
+        raise InputError(f"{name} is {told}; a whole number of {least} or more is expected")
+
+
+def check_positive(name: str, given: Any, unit: str, below: float = math.inf) -> None:
+    """Refuse all but one finite number above zero, and below another; what JAX traces passes."""
     if isinstance(given, bool | str | bytes) or getattr(given, "ndim", 0):
         wrong = True
     else:
         try:
-            wrong = not 0 < float(given) < math.inf
+            wrong = not 0 < float(given) < below
         except (TypeError, ValueError) as error:
             wrong = not (type(error).__module__.partition(".")[0] == "jax")
     if wrong:
         told = f"the text '{given[:100]}'" if isinstance(given, str) else f"{given!r:.100}"
-        raise InputError(f"{name} is {told}; expected a number of {unit} above zero")
+        raise InputError(
+            f"{name} is {told}; expected a number of {unit} above zero{f' and below {below:g}' * (below < math.inf)}"
+        )
 
 
 def check_names(name: str, given: Any) -> None:

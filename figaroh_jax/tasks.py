@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, overload
 
-from .errors import InputError, check_each, check_names, check_positive
+from .errors import InputError, check_each, check_positive
 from .formats.config import Preprocess, Task
+from .formats.taskfile import check_effects
 from .recordings.checks import Checked, checked_recordings
 from .recordings.posture_checks import check_pose_recordings
 from .simulators.native import as_backend
@@ -108,8 +109,9 @@ def diagnose(
     check_each("recordings", recordings, (Recording, PoseRecording), "`recording` and `postures` make them of arrays")
     if not len(recordings):
         raise InputError("recordings is empty: there is nothing to diagnose")
-    check_names("forbid", forbid)
-    check_positive("alpha", alpha, "the level of a test (0.05, say)")
+    check_effects("forbid", forbid)
+    check_positive("alpha", alpha, "the level of a test (0.05, say)", below=1.0)
+    check_positive("trust", trust, "relative one sigma")
     check_each("preprocess", [preprocess or Preprocess()], Preprocess, "Preprocess(cutoff=15), in Hz, say")
     postures = [one for one in recordings if isinstance(one, PoseRecording)]
     if postures:

@@ -40,6 +40,12 @@ def seen(**wrong: Any) -> Any:
     return fj.postures(**({"q": Q, "position": Q[:, :3], "base_frame": "base", "tool_frame": "hand"} | wrong))
 
 
+def device(**wrong: Any) -> Any:
+    """A device for postures with wrong arguments."""
+    return fj.Instrument("pose", "base", "hand", **wrong)
+
+
+SEEN = seen()
 WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "gravity": (lambda: fj.inverse_dynamics(robot_with("gravity", np.zeros(2)), Q, Q, Q), r"model.gravity .*\(2,\)"),
     "batch": (lambda: fj.mass_matrix(robot_with("inertia", np.zeros((3, 4, 10))), Q), "model.inertia .* jax.vmap"),
@@ -132,6 +138,69 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "instrument": (lambda: ANY.excite_postures(ROBOT, "pose"), "instrument is the text 'pose'; an Instrument"),
     "no effect": (lambda: ANY.register(ROBOT), "a class of effects is expected"),
     "grid": (lambda: ANY.shape("rad", 3), "grid is 3; the values from which the search starts"),
+    "text for a number": (
+        lambda: fj.place(VISCOUS, ROBOT, "elbow", damping="1"),
+        "damping is '1'; a number is expected",
+    ),
+    "width": (lambda: ANY.extend(ROBOT, width="1"), "width holds text; real numbers are expected"),
+    "negative width": (lambda: fj.extend(ROBOT, width=-1.0), "width is -1; finite numbers of 0 or more"),
+    "effect": (lambda: fj.calibrate(ROBOT, [SEEN], forbid=["joint_ofset"]), "forbid: no .*mean 'joint_offset'"),
+    "effect of torques": (lambda: fj.diagnose(ROBOT, [RUN], forbid=["backlsh"]), "forbid: no .*mean 'backlash'"),
+    "level of a test": (lambda: fj.diagnose(ROBOT, [RUN], alpha=2.0), "alpha is 2.0; .* above zero and below 1"),
+    "trust": (lambda: fj.diagnose(ROBOT, [RUN], trust=-1.0), "trust is -1.0; .*one sigma above zero"),
+    "trust of links": (lambda: ANY.identify(ROBOT, [RUN], trust="1"), "trust is the text '1'; .* above zero"),
+    "trust of a design": (lambda: fj.excite(ROBOT, fj.spline(4, 2.0), trust=np.nan), "trust is nan; .* above zero"),
+    "no motion": (
+        lambda: fj.excite(ROBOT, fj.spline(4, 2.0), trajectories=0),
+        "trajectories is 0; a whole number of 1",
+    ),
+    "tolerance": (lambda: fj.diagnose(ROBOT, [RUN], tolerance="0.1"), "tolerance holds text"),
+    "count": (lambda: ANY.excite_postures(ROBOT, device(), count="9"), "count is the text '9'; a whole number of 1"),
+    "level": (lambda: ANY.excite_postures(ROBOT, device(), level="ful"), "level is 'ful'; did you mean 'full'"),
+    "positions": (
+        lambda: fj.excite_postures(ROBOT, device(), position_limit=np.full((4, 2), np.nan)),
+        "position_limit: 'waist' may move from nan to nan",
+    ),
+    "turned": (
+        lambda: fj.excite_postures(ROBOT, device(), position_limit=np.tile([1.0, -1.0], (4, 1))),
+        "'waist' may move from 1 to -1: the least comes first",
+    ),
+    "distances": (lambda: ANY.excite_postures(ROBOT, device(), clearance=0.1), "float; a Clearance is expected"),
+    "one accuracy": (lambda: fj.excite_postures(ROBOT, device(accuracy=1e-3)), "accuracy is 0.001; two are expected"),
+    "accuracy below zero": (
+        lambda: fj.excite_postures(ROBOT, device(accuracy=(-1.0, 1.0))),
+        "accuracy is -1.0; .* of m",
+    ),
+    "point": (lambda: fj.excite_postures(ROBOT, device(point="x")), "point holds text"),
+    "view": (lambda: fj.excite_postures(ROBOT, device(view="x")), r"view is the text 'x'; a View is .*View\(place="),
+    "steps of a fit": (lambda: fj.fit(MODEL, DATA, "effects", max_steps=-3), "max_steps is -3; a whole number of 1"),
+    "nan limit": (
+        lambda: fj.fit_linear(MODEL, DATA, BASIS, lower=np.full(23, np.nan)),
+        "lower holds nan; .* inf where",
+    ),
+    "crossed": (lambda: ANY.fit_linear(MODEL, DATA, BASIS, lower=1.0, upper=0.0), "lower is above upper: 1 and 0"),
+    "reversal": (lambda: fj.learn(ROBOT, width=-1.0), "width is -1; finite numbers of 0 or more"),
+    "position limit": (lambda: ANY.limits_of(ROBOT, position="1"), "limits.position is the text '1'; a number, a map"),
+    "limit of a joint": (lambda: ANY.limits_of(ROBOT, velocity={"elbow": "1"}), "limits.velocity: 'elbow' holds text"),
+    "law": (lambda: fj.load_loop(fj.DEMO, law="sift"), "law is 'sift'; did you mean 'soft'"),
+    "time step": (lambda: fj.load_loop(fj.DEMO, dt=-1.0), "dt is -1.0; .* s above zero"),
+    "integrator": (lambda: ANY.load_loop(fj.DEMO, integrator="rk5"), "integrator is 'rk5'; did you mean 'rk4'"),
+    "start of a device": (lambda: ANY.own_device(abs, {"x": ("0", "m", 1.0)}), "'x'.: its start holds text"),
+    "size of a device": (
+        lambda: ANY.own_device(abs, {"x": (0.0, "m", -1.0)}),
+        "about how far off, is -1.0; .* of m above",
+    ),
+    "sigma of poses": (lambda: ANY.pose_data(ROBOT, SEEN, sigma=1e-3), "sigma is 0.001; two are expected"),
+    "level of selection": (
+        lambda: fj.select(MODEL, DATA, [MODEL.effects[0]], alpha=np.nan),
+        "alpha is nan; .* below 1",
+    ),
+    "most": (lambda: fj.select(MODEL, DATA, [MODEL.effects[0]], most=-1), "most is -1; a whole number of 1 or more"),
+    "nan in a grid": (lambda: fj.shape("rad", (np.nan, 1.0)), "grid holds nan"),
+    "turned bounds": (lambda: fj.shape("rad", (1.0,), bounds=(2.0, 0.0)), r"bounds: \(2.0, 0.0\); least and greatest"),
+    "text for a bound": (lambda: ANY.amplitude("N m", lower="a"), "lower and upper holds text"),
+    "steps": (lambda: ANY.simulate(MODEL, Q, Q[0], Q[0], 0.01, steps=2.5), "steps is 2.5; a whole number of 0"),
+    "report first": (lambda: ANY.write_report("x", "y", "z"), "diagnosis is the text 'x'; a Diagnosis is expected"),
     "loop": (lambda: ANY.rollout(ROBOT, Q, Q[0]), "loop is of type RobotModel; `load_loop`"),
 }
 

@@ -16,11 +16,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..effects.kinematic import HISTORY
-from ..errors import InputError, check_each, check_kind, check_names, nearest
+from ..errors import InputError, check_each, check_kind, nearest
 from ..estimation import marginal
 from ..estimation.gravity import without_far_masses
 from ..estimation.posegroups import Measured, assemble, postures_of
 from ..estimation.posesolver import Solution, solve
+from ..formats.taskfile import check_effects
 from ..recordings.poses import PoseRecording, read_pose_recordings
 from ..recordings.posture_checks import check_pose_recordings, spread_of
 from ..results import Name, Nearest
@@ -98,7 +99,7 @@ def calibrate(
     check_each("recordings", recordings, PoseRecording, "`postures` makes one of arrays")
     if not len(recordings):
         raise InputError("recordings is empty: there is nothing to calibrate by")
-    check_names("forbid", forbid)
+    check_effects("forbid", forbid)
     notes = check_pose_recordings(None, model, recordings)
     found = _calibrated(model, recordings, forbid, progress, level, priors)
     return replace(found, notes=(*notes, *found.notes))

@@ -19,6 +19,7 @@ from ..compiled.memory import give_back_holes
 from ..effects.base import place
 from ..effects.catalogue import CATALOGUE, find, related
 from ..effects.plausibility import implausible
+from ..errors import check_count, check_finite
 from ..formats.assembly import Welded
 from ..formats.robotfile import load_robot, stated_baseline, welded_to
 from ..recordings.bandwidth import note_on
@@ -126,6 +127,8 @@ def diagnose(
     where the links as fitted cannot be, nothing is named. `welded` are bodies that the model's file fixes to its links:
     whether one seems not to be there is told.
     """
+    check_finite("tolerance", tolerance, 0.0)
+    check_count("seed", seed, 0)
     with jax.enable_x64(True):
         progress("preparing signals", 0.03)
         backend = as_backend(model)

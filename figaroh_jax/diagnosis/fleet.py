@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..compiled.batching import program
 from ..effects.base import Effect, Motion, columns
 from ..effects.catalogue import CATALOGUE
-from ..errors import InputError, nearest
+from ..errors import InputError, check_positive, nearest
 from ..estimation.accelerators import BatchFit, conditioned_rows, coordinates, fit_states
 from ..estimation.fleets import AT_ONCE, Fleet, check_fleet, fleet_of, own_arrays
 from ..estimation.states import States
@@ -130,8 +130,7 @@ def screen_fleet(
     [(1, 'asymmetric_viscous_friction')]
     """
     check_fleet(robots, q, v, a, tau)
-    if not (np.isfinite(dt) and dt > 0):
-        raise InputError(f"dt is {dt}; it is the sampling period in seconds")
+    check_positive("dt", dt, "s, the sampling period,")
     first, present = robots[0], {term.name for term in terms}
     unknown = [name for name in effects or () if name not in CATALOGUE]
     if unknown:

@@ -32,7 +32,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from ..errors import InputError
+from ..errors import InputError, check_finite, check_real
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.model import Leaf, RobotModel
 from .loops import InRollouts
@@ -197,6 +197,11 @@ def amplitude(
     >>> Drag.parameters()["drag"].unit
     'N m s2/rad2'
     """
+    _check_bounds("lower and upper", (lower, upper))
+    if expected is not None:
+        check_finite("expected", expected)
+        if np.shape(expected) != (2,):
+            raise InputError(f"expected is {expected!r:.100}; a value and its deviation are expected, (1.0, 0.02) say")
     return eqx.field(default=0.0, metadata={"parameter": Parameter(unit, True, lower, upper, expected=expected)})
 
 
@@ -221,9 +226,20 @@ def shape(
     """
     if isinstance(grid, str) or not isinstance(grid, Sequence) or not len(grid):
         raise InputError(f"grid is {grid!r:.100}; the values from which the search starts are expected, (0.1, 0.2) say")
+    check_finite("grid", grid)
+    _check_bounds("bounds", bounds)
     lower, upper = bounds or (min(grid), max(grid))
     parameter = Parameter(unit, False, lower, upper, tuple(grid), choice, hole)
     return eqx.field(default=grid[0], metadata={"parameter": parameter})
+
+
+def _check_bounds(name: str, given: Any) -> None:
+    """Refuse all but least and greatest, in this order."""
+    if given is None:
+        return
+    check_real(name, given)
+    if np.shape(given) != (2,) or not given[0] <= given[1]:
+        raise InputError(f"{name}: {given!r:.100}; least and greatest are expected, (0.0, 1.0) say")
 
 
 class Place(eqx.Module):
@@ -581,7 +597,7 @@ def _number(effect: type[Effect], name: str, value: Any) -> Any:
     if isinstance(value, Tracer) and value.ndim == 0:
         return value
     try:
-        number = np.float64(value)
+        number = None if np.asarray(value).dtype.kind in "SU" else np.float64(value)  # of text it would read a number
     except (TypeError, ValueError):
         number = None
     if number is None or np.ndim(number) or np.isnan(number):

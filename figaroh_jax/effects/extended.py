@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from ..compiled.batching import on_host
 from ..compiled.precision import in_float64
-from ..errors import InputError, check_real
+from ..errors import InputError, check_finite, check_real
 from ..rigid.dynamics import inverse_dynamics, refuse_singular
 from ..rigid.kinematics import states
 from ..rigid.model import RobotModel
@@ -129,6 +129,7 @@ def extend(
     robot, present = (model.robot, model.effects) if isinstance(model, ExtendedModel) else (model, ())
     if width is None:
         width = model.width if isinstance(model, ExtendedModel) else 0.0
+    check_finite("width", width, 0.0)
     if np.shape(width) not in ((), (robot.nv,)):
         raise InputError(f"width has shape {np.shape(width)}; robot '{robot.name}' needs one number or {robot.nv}")
     space: Any = jnp if isinstance(width, jax.Array) else np

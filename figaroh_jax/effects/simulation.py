@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from ..compiled.precision import in_float64
-from ..errors import InputError
+from ..errors import InputError, check_count
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.kinematics import states
 from ..rigid.model import RobotModel
@@ -88,8 +88,11 @@ def simulate(
     if callable(command):
         if steps is None:
             raise InputError("a command that is a function needs the number of steps")
+        check_count("steps", steps, 0)
         return _simulate(opened(extended), command, jnp.zeros((steps, q.size)), q, v, jnp.float64(dt))
     torque = states(extended.robot, command=command)[0]
+    if steps is not None:
+        check_count("steps", steps, 0)
     if torque.ndim != 2 or (steps is not None and torque.shape[0] < steps):
         raise InputError(f"command has shape {torque.shape}; one row of torques for each step is needed")
     return _simulate(opened(extended), None, torque[:steps], q, v, jnp.float64(dt))

@@ -27,6 +27,7 @@ from ..compiled.precision import in_float64
 from ..effects.extended import ExtendedModel, changed_robot, extend, opened, read_position, read_sensors
 from ..effects.kinematic import PostureMotion, Postures, twists_of
 from ..errors import InputError, check_each, check_kind, check_real
+from ..recordings.arrays import check_accuracy
 from ..recordings.checks import check_columns, position_findings, report_findings
 from ..recordings.dataset import Recording
 from ..recordings.devices import Device
@@ -303,6 +304,8 @@ def pose_data(
     check_kind("model", model, (RobotModel, ExtendedModel), "pose_data(model, recordings)")
     if not isinstance(recordings, PoseRecording):
         check_each("recordings", recordings, PoseRecording, "`postures` makes one of arrays")
+    if sigma is not None:
+        check_accuracy(sigma, "sigma", may_lack=False)
     given = [recordings] if isinstance(recordings, PoseRecording) else list(recordings)
     each_joint = robot.nq == robot.nv and all(one.position.shape[1] == robot.nv for one in given)
     if each_joint:  # else the kinematics refuse it

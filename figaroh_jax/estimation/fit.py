@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from ..compiled.batching import DRAFT_OPTIONS, FEW, filtered_program, on_host, traced
 from ..compiled.precision import in_float64
 from ..effects.extended import ExtendedModel, extend
-from ..errors import InputError, check_real
+from ..errors import InputError, check_count, check_real
 from ..rigid.chain import chain_between
 from ..rigid.model import Leaf, RobotModel
 from . import posefit
@@ -120,6 +120,7 @@ def fit(
         raise InputError(
             f"solver is {solver!r}; one of optimistix is expected: optimistix.LevenbergMarquardt(1e-8, 1e-8)"
         )
+    check_count("max_steps", max_steps)
     parts = as_data(whole, data)
     chosen = chosen_of(whole, parts, free)
     precision = _precision(chosen, whole, prior or {}) * chosen.sizes**2

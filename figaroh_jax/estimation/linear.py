@@ -214,6 +214,12 @@ def _limits(
     high = jnp.full(rank, jnp.inf) if upper is None else jnp.broadcast_to(jnp.asarray(upper, float), (rank,))
     if traced(*given):
         return low, high, np.arange(rank)
+    for name, some in (("lower", lower), ("upper", upper)):
+        if some is not None and np.isnan(np.asarray(some, float)).any():
+            raise InputError(f"{name} holds nan; a number is expected, or inf where there is no limit")
+    if (crossed := np.flatnonzero(np.asarray(low > high))).size:
+        k = int(crossed[0])
+        raise InputError(f"lower is above upper: {float(low[k]):g} and {float(high[k]):g} of the basis' name {k + 1}")
     finite = [np.broadcast_to(np.isfinite(np.asarray(x)), rank) for x in given]
     return low, high, np.flatnonzero(np.any(finite, axis=0)) if finite else np.zeros(0, int)
 

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from ..compiled.precision import in_float64
 from ..effects.base import Effect, Place, changed
 from ..effects.extended import ExtendedModel, extend, opened
-from ..errors import InputError, check_list
+from ..errors import InputError, check_count, check_list, check_positive
 from ..results import Cause, Gain, Name, Selection
 from ..rigid.model import RobotModel
 from .data import Data, as_data
@@ -77,6 +77,8 @@ def select(
     """
     whole = model if isinstance(model, ExtendedModel) else extend(model)
     check_list("candidates", candidates)
+    check_positive("alpha", alpha, "the level of a test (0.05, say)", below=1.0)
+    check_count("most", most)
     parts, left = as_data(whole, data), list(candidates)
     if not left or not all(isinstance(one, Effect) for one in left):
         raise InputError("candidates: effects at their places are expected: [place(effect, model, ['elbow']), ...]")

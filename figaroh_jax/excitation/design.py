@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from ..effects.base import Effect
 from ..effects.extended import ExtendedModel
-from ..errors import InputError, check_kind, check_one_of, check_real
+from ..errors import InputError, check_count, check_kind, check_one_of, check_positive, check_real
 from ..rigid.model import RobotModel
 from .information import Learned, learn
 from .limits import Limits, Torque, limits_of, unmeetable
@@ -121,8 +121,10 @@ def excite(
     named: Any = objective
     if isinstance(named, str):
         check_one_of("objective", named, get_args(Objective))
-    for name, number in {"starts": starts, "trajectories": trajectories}.items():
-        check_kind(name, number, (int, np.integer), "how many")
+    check_count("starts", starts)
+    check_count("trajectories", trajectories)
+    check_count("seed", seed, 0)
+    check_positive("trust", trust, "relative one sigma")
     asked = _asked(model, limits, learned, start)
     with jax.enable_x64(True):
         aim = _aim(asked, basis, objective, predict, separate, trust, rate)

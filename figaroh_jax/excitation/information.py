@@ -19,7 +19,7 @@ from ..compiled.batching import program
 from ..compiled.precision import in_float64
 from ..effects.base import Effect
 from ..effects.extended import ExtendedModel, require_single_axes
-from ..errors import InputError, check_kind, check_positive, nearest
+from ..errors import InputError, check_finite, check_kind, check_positive, check_real, nearest
 from ..estimation.base_parameters import base_parameters
 from ..estimation.columns import column_names, friction_terms, random_states
 from ..estimation.priors import rigid_prior
@@ -105,6 +105,9 @@ def learn(
     check_kind("known", known or Baseline(), Baseline, "Baseline(viscous=True), say")
     if trust is not None:
         check_positive("trust", trust, "relative one sigma")
+    check_finite("width", width, 0.0)
+    if sigma is not None:
+        check_real("sigma", sigma)
     robot, effects = (model.robot, model.effects) if isinstance(model, ExtendedModel) else (model, ())
     require_single_axes(robot, "a motion that is designed")
     terms = friction_terms(robot, known or Baseline())

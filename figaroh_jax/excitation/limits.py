@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import InputError, check_kind, check_positive, nearest
+from ..errors import InputError, check_kind, check_positive, check_real, nearest
 from ..rigid.model import RobotModel
 from .certified import nearest_approaches
 from .clearance import Clearance
@@ -114,6 +114,8 @@ def limits_of(
     """
     check_kind("robot", robot, RobotModel, "load_urdf reads one; an ExtendedModel holds one as `.robot`")
     check_positive("scale", scale, "times the limits")
+    if clearance is not None:
+        check_kind("clearance", clearance, Clearance, "`clearance_of` makes one")
     given = {
         "velocity": _by_joint(robot, "velocity", velocity, np.asarray(robot.velocity_limit, float)),
         "acceleration": _by_joint(robot, "acceleration", acceleration, np.full(robot.nv, np.inf)),
@@ -172,6 +174,7 @@ def _by_joint(robot: RobotModel, kind: str, given: Any, own: Float[np.ndarray, "
         return np.full(robot.nv, float(given))
     out = np.where(own > 0, own, np.inf)  # as `model` has the joints that the map leaves out
     for name, value in given.items():
+        check_real(f"limits.{kind}: '{name}'", value)
         out[_dof(robot, kind, name)] = value
     return out
 
@@ -180,8 +183,13 @@ def _positions(robot: RobotModel, given: Any) -> Float[np.ndarray, "nv 2"]:
     own = np.array(robot.position_limit, float)
     if given is None:
         return np.tile([-np.inf, np.inf], (robot.nv, 1))
+    if isinstance(given, str) and given != "model":
+        raise InputError(
+            f"limits.position is the text '{given[:100]}'; a number, a map by joint, None or 'model' is expected"
+        )
     if isinstance(given, Mapping):
         for name, value in given.items():
+            check_real(f"limits.position: '{name}'", value)
             pair = (-value, value) if np.ndim(value) == 0 else tuple(value)
             own[_dof(robot, "position", name)] = pair
         return own

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -21,10 +21,10 @@ from jaxtyping import Float, Int
 from ..calibration.candidates import geometry_columns
 from ..calibration.gauge import find_gauge
 from ..effects.kinematic import Column
-from ..errors import InputError, check_kind
+from ..errors import InputError, check_count, check_each, check_finite, check_kind, check_one_of, check_real
 from ..estimation import posefit
 from ..estimation.posegroups import Measured, assemble, postures_of
-from ..recordings.arrays import postures as recorded
+from ..recordings.arrays import check_accuracy, postures as recorded
 from ..recordings.devices import POSITION, Device, Planes, Sockets
 from ..rigid.chain import chain_between
 from ..rigid.model import RobotModel
@@ -267,6 +267,34 @@ class _Calibrated:
         return J / sigma[:, None]
 
 
+def _check_instrument(one: Instrument) -> None:
+    """Refuse what a device cannot be; its kind and frames are asked for where its rows are made."""
+    check_accuracy(one.accuracy, may_lack=False)
+    check_finite("point", one.point)
+    if np.shape(one.point) != (3,):
+        raise InputError(f"point is {one.point!r:.100}; three numbers in m are expected, in the tool frame")
+    if one.view is not None:
+        check_kind("view", one.view, View, "View(place=(1, 0, 1), axis=(-1, 0, 0)), say")
+    check_each("touched", one.touched, Touch, "Touch(place=(0.5, 0, 0), axis=(0, 0, 1)), say")
+
+
+def _limits(model: RobotModel, given: Float[np.ndarray, "nv 2"] | None) -> Float[np.ndarray, "nv 2"]:
+    """Least and greatest position of each joint: a turn where there is no limit."""
+    if given is not None:
+        check_real("position_limit", given)
+    limits = np.array(model.position_limit if given is None else given, float)
+    if limits.shape != (model.nv, 2):
+        raise InputError(f"position_limit has shape {limits.shape}; least and greatest of each joint, {(model.nv, 2)}")
+    wrong = ~(limits[:, 0] <= limits[:, 1])  # nan too
+    if given is not None and wrong.any():
+        low, high = limits[int(np.argmax(wrong))]
+        raise InputError(
+            f"position_limit: '{model.dof_names[int(np.argmax(wrong))]}' may move from {low:g} to {high:g}: the least"
+            " comes first"
+        )
+    return np.where(np.isfinite(limits), limits, [-np.pi, np.pi])
+
+
 def excite_postures(
     model: RobotModel,
     instrument: Instrument,
@@ -297,8 +325,14 @@ def excite_postures(
     check_kind(
         "instrument", instrument, Instrument, "Instrument('position', base_frame='base', tool_frame='hand'), say"
     )
-    limits = np.array(model.position_limit if position_limit is None else position_limit, float)
-    limits = np.where(np.isfinite(limits), limits, [-np.pi, np.pi])
+    _check_instrument(instrument)
+    check_count("count", count)
+    check_count("candidates", candidates)
+    check_count("seed", seed, 0)
+    check_one_of("level", level, get_args(Level))
+    if clearance is not None:
+        check_kind("clearance", clearance, Clearance, "`clearance_of` makes one")
+    limits = _limits(model, position_limit)
     generator = np.random.default_rng(seed)
     allowed = _Allowed(model, instrument, clearance, limits)
     q = allowed.candidates(limits, candidates, count, generator)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from ..errors import InputError, nearest
-from .taskfile import CONTRACT_EFFECTS
+from .taskfile import check_effect
 
 __all__ = [
     "Columns",
@@ -54,11 +54,7 @@ def _diagonal(value: Any) -> Any:
 
 
 def _effect(name: str) -> str:
-    from ..effects.catalogue import CATALOGUE
-
-    known = list(dict.fromkeys([*CATALOGUE, *CONTRACT_EFFECTS]))
-    if name not in known:
-        raise ValueError(f"no effect '{name}'{nearest(name, known)}")
+    check_effect(name)
     return name
 
 

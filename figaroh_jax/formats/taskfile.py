@@ -14,10 +14,19 @@ from typing import Any
 
 import yaml
 
-from ..errors import InputError
+from ..errors import InputError, check_names, nearest
 from .files import read_file
 
-__all__ = ["CONTRACT_EFFECTS", "given_task", "merge", "read_task", "read_yaml", "where"]
+__all__ = [
+    "CONTRACT_EFFECTS",
+    "check_effect",
+    "check_effects",
+    "given_task",
+    "merge",
+    "read_task",
+    "read_yaml",
+    "where",
+]
 
 # The names that the contract fixes, of every level; a task may forbid one that this version does not look for.
 CONTRACT_EFFECTS = """
@@ -31,11 +40,32 @@ friction_loss actuator_gain command_delay actuator_saturation voltage_saturation
 contact_friction
 """.split()
 
+
 LARGEST = 1 << 18  # bytes
 MOST_NODES = 50_000  # after expansion of the aliases
 DEEPEST = 100
 LONGEST_NUMBER = 500  # characters; what is longer is text (base 60, which YAML has, takes a quadratic time)
 _NUMBERS = tuple(f"tag:yaml.org,2002:{kind}" for kind in ("int", "float", "timestamp"))
+
+
+def check_effect(name: str) -> None:
+    """Raise `InputError`, with the nearest known name, where no effect of any level is called so."""
+    from ..effects.catalogue import CATALOGUE, ROLLOUTS
+    from ..effects.registry import POSES
+
+    known = list(dict.fromkeys([*CATALOGUE, *POSES, *ROLLOUTS, *CONTRACT_EFFECTS]))
+    if name not in known:
+        raise InputError(f"no effect '{name}'{nearest(name, known)}")
+
+
+def check_effects(name: str, given: Any) -> None:
+    """Refuse what is no list of names of effects; `name` is that of the argument."""
+    check_names(name, given)
+    for one in given:
+        try:
+            check_effect(one)
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from None
 
 
 class _Loader(yaml.SafeLoader):

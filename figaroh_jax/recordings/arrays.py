@@ -135,7 +135,7 @@ def postures(
         check_kind("device", device, Device, "`own_device` makes one of your function")
     if distance is not None:
         check_positive("distance", distance, "m")
-    _check_accuracy(accuracy)
+    check_accuracy(accuracy)
     position = _matrix(q, "q", source)
     known = dict(units or {})
     scale = _unit(known.pop("measurement", "m"), {"m": 1.0, "mm": 1e-3}, "measurement", source)
@@ -177,12 +177,14 @@ def _check_words(names: Any, units: Any, known: Sequence[str], role: Any, load: 
         check_kind("load", load, Load, "fj.Load(frame='hand', mass=2.0), in kg")
 
 
-def _check_accuracy(accuracy: Any) -> None:
+def check_accuracy(accuracy: Any, name: str = "accuracy", *, may_lack: bool = True) -> None:
+    """Refuse all but two sigmas above zero, in m and in rad; None is one that is not known (`may_lack`)."""
     if isinstance(accuracy, str) or not hasattr(accuracy, "__len__") or len(accuracy) != 2:
-        raise InputError(f"accuracy is {accuracy!r:.100}; two are expected: one sigma in m and one in rad, or None")
+        told = "two are expected: one sigma in m and one in rad" + ", or None" * may_lack
+        raise InputError(f"{name} is {accuracy!r:.100}; {told}")
     for sigma, unit in zip(accuracy, ("m", "rad"), strict=True):
-        if sigma is not None:
-            check_positive("accuracy", sigma, unit)
+        if sigma is not None or not may_lack:
+            check_positive(name, sigma, unit)
 
 
 class _Table(NamedTuple):

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..errors import InputError, check_each, check_kind
+from ..errors import InputError, check_each, check_finite, check_kind, check_positive
 from ..rigid import lie
 from ..rigid.model import Leaf
 
@@ -330,9 +330,13 @@ def own_device(
     for name, given in unknowns.items():
         try:
             start, unit, size = given
+            check_finite(f"unknowns['{name}']: its start", start)
+            check_positive(f"unknowns['{name}'], about how far off,", size, str(unit))
             starts.append(float(start))
             names.append((str(name), str(unit), float(size)))
-        except (TypeError, ValueError):
+        except (TypeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
             raise InputError(
                 f"unknowns['{name}'] is {given!r:.100}; its start, its unit and about how far off that is are expected,"
                 " (1.0, 'm', 0.1) say"

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..errors import InputError
+from ..errors import InputError, check_kind, check_path
 from ..results import Candidate, Diagnosis, Part, Trace
 from . import wording
 from .picture import robot_picture
@@ -79,7 +79,7 @@ class _Left(NamedTuple):
     parts: list[_Goes]
 
 
-def write_report(diagnosis: Diagnosis, path: Path, title: str) -> None:
+def write_report(diagnosis: Diagnosis, path: str | Path, title: str) -> None:
     """Write the page of a diagnosis to `path`; `title` is the robot's name, as the verdict's sentence says it.
 
     >>> import pathlib, tempfile, figaroh_jax as fj
@@ -89,6 +89,9 @@ def write_report(diagnosis: Diagnosis, path: Path, title: str) -> None:
     ...     "bench arm" in pathlib.Path(folder, "report.html").read_text()
     True
     """
+    check_kind("diagnosis", diagnosis, Diagnosis, "write_report(diagnosis, path, title)")
+    check_path("path", path)
+    path = Path(path)
     path.write_text(_page(diagnosis, title, path.parent), encoding="utf-8")
 
 

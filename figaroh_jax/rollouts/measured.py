@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from ..effects.base import Effect
 from ..effects.extended import ExtendedModel, changed_robot
-from ..errors import InputError, check_each, check_kind, nearest
+from ..errors import InputError, check_each, check_finite, check_kind, nearest
 from ..recordings.checks import position_findings, report_findings
 from ..recordings.dataset import Recording
 from ..rigid.model import Leaf, RobotModel
@@ -126,6 +126,10 @@ def rollout_data(
     unknown = next((name for name in drives if name not in DRIVES), None)
     if unknown is not None:
         raise InputError(f"drives: no number '{unknown}'{nearest(unknown, DRIVES)}")
+    if noise is not None:
+        check_finite("noise", noise)
+        if not (np.asarray(noise) > 0).all():
+            raise InputError("noise: one sigma above zero is expected, of all encoders or one for each, rad or m")
     check_kind("loop", loop, Loop, "`load_loop` makes one of a robot's file and its drives")
     if not isinstance(recordings, Recording):
         check_each("recordings", recordings, Recording, "`recording` makes one of arrays")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
-from ..errors import InputError, nearest
+from ..errors import InputError, check_one_of, check_positive, nearest
 from ..formats.config import checked_drive
 from ..formats.files import model_format
 from ..formats.mjcf import actuator_of, compile_mjcf, compiled_robot, disabled, engine, joint_names
@@ -51,6 +51,12 @@ def load_loop(
     >>> loop.drives.names
     ('elbow',)
     """
+    if dt is not None:
+        check_positive("dt", dt, "s")
+    if law is not None:
+        check_one_of("law", law, ("soft", "hard"))
+    if integrator is not None:
+        check_one_of("integrator", integrator, get_args(Integrator))
     form = model_format(path)
     if form != "mjcf":
         robot = read_robot(path, joints, posture, gravity, root)
