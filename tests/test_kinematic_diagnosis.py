@@ -16,6 +16,7 @@ import test_calibration as tasks
 from generators import postures
 from schema import matches
 
+import figaroh_jax as fj
 from figaroh_jax import cli
 from figaroh_jax.calibration import thresholds
 from figaroh_jax.calibration.kinematic_diagnosis import diagnose_poses
@@ -53,6 +54,26 @@ def answered(folder: Path, robot: str, effect: str | None, size: float, seed: in
     case = postures.hide(arm, effect, size, np.random.default_rng(seed))
     found = bench.diagnose(arm, case, forbid)
     return bench.grade(case, found), found, case
+
+
+@pytest.mark.parametrize("hidden", [0.0, 0.02])
+def test_postures_without_noise_are_answered(hidden: float):
+    """Points by Pinocchio, exact to rounding: a simulation's (it ended in a singular matrix)."""
+    robot = pin.buildModelFromUrdf(fj.DEMO)
+    data, q = robot.createData(), np.random.default_rng(0).uniform(-1.4, 1.4, (30, 4))
+    seen = np.zeros((len(q), 3))
+    for row, one in zip(seen, q, strict=True):
+        pin.framesForwardKinematics(robot, data, one + [0.0, hidden, 0.0, 0.0])
+        row[:] = data.oMf[robot.getFrameId("hand")].act(np.array([0.05, 0.02, 0.03]))
+    run = postures_of(q=q, position=seen, base_frame="base", tool_frame="hand")
+    found = fj.diagnose(load_urdf(fj.DEMO), [run])
+    assert found.verdict == ("named" if hidden else "nothing")
+    assert [str(cause.name) for cause in found.causes] == ["joint_offset (shoulder)"] * bool(hidden)
+    for cause in found.causes:  # beside links that may be off as well, which its deviation counts
+        told = cause.parameters["offset"]
+        assert abs(told.value - hidden) < min(told.std, 1e-3)
+    alone = fj.calibrate(load_urdf(fj.DEMO), [run], level="joint_offset").solution.parameters["joint_offset shoulder"]
+    assert abs(alone.value - hidden) < 1e-7
 
 
 def test_every_kinematic_effect_of_the_contract_can_be_named_and_hidden():

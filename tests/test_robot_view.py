@@ -18,7 +18,7 @@ from figaroh_jax import DEMO
 from figaroh_jax.cli import main
 from figaroh_jax.effects.extended import extend
 from figaroh_jax.errors import InputError
-from figaroh_jax.formats.export import write_model
+from figaroh_jax.formats.export import model_files, write_model
 from figaroh_jax.formats.urdf import load_urdf
 from figaroh_jax.reporting.provenance import provenance
 from figaroh_jax.reporting.robot_view import RobotView, serve, show_run, view_of
@@ -84,6 +84,34 @@ class Server:
 
     def add_dropdown(self, name: str, options: Any) -> Any:
         return self.add_slider(name, initial_value=options[0], min=0, max=0)
+
+
+def test_a_calibration_of_an_mjcf_is_drawn_as_mujoco_has_the_robot(tmp_path: Path):
+    """Its run holds no URDF. A hidden offset of a joint moves the drawn tips to where MuJoCo has them."""
+    mujoco = pytest.importorskip("mujoco")
+    (tmp_path / "arm.xml").write_text(model_files(extend(load_urdf(DEMO)))["robot.xml"])
+    mj = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))
+    data, hidden = mujoco.MjData(mj), np.array([0.0, 0.02, 0.0, 0.0])
+    q = np.random.default_rng(0).uniform(-1.2, 1.2, (30, 4))
+
+    def tips(at: np.ndarray) -> np.ndarray:
+        data.qpos[:] = at
+        mujoco.mj_kinematics(mj, data)
+        return np.array(data.xanchor)
+
+    def marker(at: np.ndarray) -> np.ndarray:
+        tips(at)
+        return data.site("hand").xpos + data.site("hand").xmat.reshape(3, 3) @ [0.05, 0.02, 0.03]
+
+    np.savez(tmp_path / "run.npz", q=q, seen=[marker(one + hidden) for one in q])
+    device = "{position: seen, base_frame: base, tool_frame: hand, unknown: [tool_frame]}"
+    entry = f"data: [{{file: run.npz, position: q, measurement: {device}}}]"
+    (tmp_path / "task.yaml").write_text(f"robot: {{model: arm.xml}}\n{entry}")
+    run = str(tmp_path / "run")
+    assert main(["calibrate", str(tmp_path / "task.yaml"), "--level", "joint_offset", "--out", run, "--quiet"]) == 0
+    lines = view_of(Path(run))[0].lines(q[0])
+    np.testing.assert_allclose(np.concatenate([lines["links"], lines["named"]])[:, 1], tips(q[0] + hidden), atol=1e-5)
+    np.testing.assert_allclose(lines["nominal"][:, 1], tips(q[0]), rtol=0, atol=1e-9)
 
 
 def written(folder: Path, corrected: RobotModel) -> Path:

@@ -27,7 +27,7 @@ from .calibrated import Calibration
 from .calibration import Run
 from .candidates import GEOMETRY, moved_rows, moves, twist_rows
 from .kinematic_evidence import Evidence, weigh
-from .kinematic_scores import Scores, Tested, row_noise, score_blocks, score_jitter
+from .kinematic_scores import EXACT, Scores, Tested, row_noise, score_blocks, score_jitter
 from .outliers import playing_joints, still_outliers, variance_along
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def diagnose_poses(
             aside += [(c, "held-out postures are predicted no better than by the frames alone") for c in effects]
             geometry, effects = [], []
         outliers = [c for c in calibration.causes if c.name.effect == "outlier"]
-        if play.found:  # the postures that a joint's play moves farthest are no errors of their own
+        if play.found and not _exact(run):  # the postures that a joint's play moves farthest are no errors of their own
             notes.append(play.note)
             still = [k in play.outliers for k in run.aside]
             within = [c for c, s in zip(outliers, still, strict=True) if not s]
@@ -114,7 +114,8 @@ def diagnose_poses(
             outliers, geometry, effects = [], [], []
         causes = tuple([*outliers, *geometry, *effects])
         p_value = min(1.0, 2.0 * min(own.p_value, run.p_effects))
-        rest = own.rest or run.history or play.found or p_rest < thresholds.OF_ALPHA * alpha
+        left_over = run.history or play.found or p_rest < thresholds.OF_ALPHA * alpha
+        rest = own.rest or (left_over and not _exact(run))
         rest = rest or calibration.contradicted or _beyond_accuracy(recordings, calibration)
         rest = rest or (found and not (geometry or effects)) or len(own.causes) > len(geometry)
         nearest = [*own.nearest, *(Nearest(c.name, _share(c.gain), why) for c, why in aside)]
@@ -392,6 +393,12 @@ def _play(run: Run, alpha: float, tolerance: float) -> _Play:
             f" or poor repeatability ({joints[worst][0]} would explain most)"
         )
     return _Play(True, tuple((name,) for name in names), tuple(outliers), note)
+
+
+def _exact(run: Run) -> bool:
+    """Whether no more is left than rounding, whose pattern is no cause's: postures of a simulation without noise."""
+    linear, posterior = run.fit[1:3]
+    return bool((posterior.noise[linear.channel[run.used]] <= EXACT).all())
 
 
 def _beyond_accuracy(recordings: Sequence[PoseRecording], calibration: Calibration) -> bool:

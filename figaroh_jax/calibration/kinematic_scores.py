@@ -20,10 +20,10 @@ from jaxtyping import Bool, Float, Int
 from ..estimation.marginal import FLAT, Linear, Posterior
 from . import thresholds
 
-__all__ = ["Scores", "Tested", "row_noise", "score_blocks", "score_jitter", "score_waves", "waves_shown"]
+__all__ = ["EXACT", "Scores", "Tested", "row_noise", "score_blocks", "score_jitter", "score_waves", "waves_shown"]
 
 _CUT = 1e-16  # square of the share of a column that must be left beside the fit: more than rounding leaves
-_EXACT = 1e-8  # m or rad: what a simulation says without noise counts as no more exact, or rounding decides
+EXACT = 1e-8  # m or rad: what a simulation says without noise counts as no more exact, or rounding decides
 _DRAWS = 400
 _WAVE_DRAWS = 200
 
@@ -74,7 +74,7 @@ def score_blocks(fit: Tested, blocks: Sequence[Float[Array, "rows _"]], seed: in
 def row_noise(linear: Linear, posterior: Posterior) -> Float[Array, " rows"]:
     """One sigma of every row, m or rad, wider where its posture has less weight."""
     weight = np.where(linear.posture >= 0, posterior.weight[linear.posture], 1.0)
-    return np.maximum(posterior.noise[linear.channel], _EXACT) / np.sqrt(weight)
+    return np.maximum(posterior.noise[linear.channel], EXACT) / np.sqrt(weight)
 
 
 class Waves(NamedTuple):

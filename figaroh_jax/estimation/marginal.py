@@ -19,6 +19,7 @@ __all__ = ["FLAT", "Linear", "Posterior", "fit", "honest_covariance", "left_out"
 FLAT = -1  # group of unknowns without a prior
 _FREEDOM = 10.0  # of the Student t: fewer cost clean sets more than they gain on dirty ones
 _PSEUDO = 2.0
+_LEAST_NOISE = 1e-9  # m or rad: of rows without noise the rounding would make normal matrices singular
 _ANCHOR = 1e-10  # precision of flat unknowns, so that one without any row stays where it is
 
 Array = np.ndarray
@@ -166,7 +167,7 @@ def _row_weights(weight: Array, posture: Array) -> Array:
 def _first_noise(residual: Array, channel: Array) -> Array:
     return (
         np.array([np.sqrt(np.mean(residual[channel == c] ** 2)) if np.any(channel == c) else 1.0 for c in (0, 1)])
-        + 1e-12
+        + _LEAST_NOISE
     )
 
 
@@ -176,7 +177,7 @@ def _noise(r: Array, root: Array, leverage: Array, channel: Array, before: Array
         mine = channel == c
         if mine.any():
             left = max(mine.sum() - leverage[mine].sum(), 1.0)
-            found[c] = np.sqrt(max(np.sum((root[mine] * r[mine]) ** 2) / left, 1e-24))
+            found[c] = np.sqrt(max(np.sum((root[mine] * r[mine]) ** 2) / left, _LEAST_NOISE**2))
     return found
 
 

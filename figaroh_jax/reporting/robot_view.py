@@ -134,7 +134,8 @@ def view_of(folder: Path) -> tuple[RobotView, Motions]:
         robot = load_model(folder / "model").robot
     else:
         names = None if nominal is None else nominal.joint_names
-        robot = read_robot(folder / "model" / "robot.urdf", names, kinematic=True)
+        files = [folder / "model" / name for name in ("robot.urdf", "robot.xml")]  # of an MJCF there is no URDF
+        robot = read_robot(next((one for one in files if one.is_file()), files[0]), names, kinematic=True)
     if nominal is not None and nominal.joint_names != robot.joint_names:
         nominal = None
     return RobotView(robot, _said(causes), nominal), motions or {}
