@@ -1,7 +1,7 @@
 """An effect of your own where no torque is recorded: registered, hidden in MuJoCo's own simulation, and named from it.
 
 A ball that drops into a notch as a servo's joint passes it. MuJoCo C does not know it either: there it is a torque that
-a loop of Python applies (`qfrc_applied`). Run `python examples/own_rollout_effect.py`; ten seconds, with `mujoco`.
+a loop of Python applies (`qfrc_applied`). Run `python examples/own_rollout_effect.py`; half a minute, with `mujoco`.
 """
 
 import tempfile

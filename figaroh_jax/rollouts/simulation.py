@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from ..compiled.batching import traced
+from ..compiled.batching import filtered_program, traced
 from ..errors import InputError, check_real
 from ..rigid.kinematics import check_shapes
 from . import own
@@ -85,7 +85,7 @@ def _refuse_divergence(loop: Loop, found: Rollout, **given: Array) -> None:
         )
 
 
-@eqx.filter_jit
+@filtered_program
 def _rollout(loop: Loop, u: Array, q: Array, v: Array) -> Rollout:
     weight = mobility(loop)
     seen = delayed(u[..., None], jnp.asarray(loop.drives.delay), loop.dt)
