@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..compiled.batching import traced
+from ..compiled.batching import program, traced
 from ..compiled.linear_algebra import symmetric_solve
 from ..compiled.precision import in_float64
 from ..effects.base import Effect, Motion, columns, movable
@@ -160,7 +160,13 @@ def fit_linear(
     G, total = jnp.einsum("b,bjkl->jkl", weight, products), jnp.maximum(weight @ rows, 1e-300)
     kept = jnp.asarray(basis.into)[np.array(basis.kept)]  # kept parameters of the coordinates
     low, high, limited = _limits(lower, upper, len(kept))
-    held = kept[limited]  # of the parameters that have a limit
+    return _weighed(G, total, kept, low, high, tuple(limited.tolist()))
+
+
+def _fitted(G: Array, total: Array, kept: Array, low: Array, high: Array, which: tuple[int, ...]) -> LinearFit:
+    """The fit of products `G` (joints, rank + 1, rank + 1) of `total` rows of each joint; `which` have a limit."""
+    limited = np.array(which, int)
+    held = kept[limited]
 
     def solved(scale: Array, side: Array) -> _Turn:
         A = jnp.einsum("jkl,j->kl", G, scale)
@@ -188,6 +194,9 @@ def fit_linear(
     nearest = jnp.where(values - low < high - values, low, high)
     values = jnp.where(active, nearest, jnp.clip(values, low, high))  # on a limit exactly
     return LinearFit(values, jnp.sqrt(variance), jnp.sqrt(squares(last.z) / total), active, last.found)
+
+
+_weighed = program(_fitted, static_argnums=5)  # else its loop would be compiled at each call
 
 
 class _Turn(NamedTuple):
