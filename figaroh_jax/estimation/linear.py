@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..compiled.batching import program, traced
+from ..compiled.batching import filtered_program, program, traced
 from ..compiled.linear_algebra import symmetric_solve
 from ..compiled.precision import in_float64
 from ..effects.base import Effect, Motion, columns, movable
@@ -153,7 +153,7 @@ def fit_linear(
     for name, given in {"counts": counts, "lower": lower, "upper": upper}.items():
         if given is not None:
             check_real(name, given)
-    products, rows = _products(whole, data, basis)
+    products, rows = _products(whole, data, basis.into)
     weight = jnp.ones(len(rows)) if counts is None else jnp.asarray(counts, float)
     if weight.shape != (len(rows),):
         raise InputError(f"counts has shape {weight.shape}; the data has {len(rows)} blocks")
@@ -263,10 +263,11 @@ def _within(K: Array, c: Array, low: Array, high: Array, side: Array) -> tuple[A
     return pull / size, side, done
 
 
-def _products(model: ExtendedModel, data: TorqueData, basis: Basis) -> tuple[Array, Array]:
+@filtered_program
+def _products(model: ExtendedModel, data: TorqueData, into: Array | np.ndarray) -> tuple[Array, Array]:
     """Products of [columns, torque] by block and joint, and rows of each block and joint."""
     X, y, weight = _rows(model, data)  # n M nv columns
-    Z = jnp.einsum("nmjc,ck->njkm", X, jnp.asarray(basis.into), precision=jax.lax.Precision.HIGHEST)
+    Z = jnp.einsum("nmjc,ck->njkm", X, jnp.asarray(into), precision=jax.lax.Precision.HIGHEST)
     both = jnp.concatenate([Z, jnp.moveaxis(y, 1, 2)[:, :, None]], axis=2) * jnp.moveaxis(weight, 1, 2)[:, :, None]
     counted = (jnp.moveaxis(weight, 1, 2) > 0).astype(both.dtype)
     together = data.together or both.shape[-1]
