@@ -39,6 +39,7 @@ __all__ = [
     "over_samples",
     "program",
     "sized_program",
+    "staged",
     "put",
     "reused",
     "to_device",
@@ -85,7 +86,7 @@ def filtered_program(function: Callable[..., Any], cpu: Mapping[str, Any] = CPU_
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
-        return (on_cpu if on_host(*arguments) else elsewhere)(*arguments)
+        return (on_cpu if on_host(*arguments) and not staged() else elsewhere)(*arguments)
 
     return call
 
@@ -117,6 +118,11 @@ def traced(*trees: Any) -> bool:
 def on_host(*trees: Any) -> bool:
     """Whether the work is done on this machine's CPU, outside of JAX's transformations."""
     return jax.default_backend() == "cpu" and not traced(*trees)
+
+
+def staged() -> bool:
+    """Whether a `jit` (or a loop of JAX) is at work around the caller: new arrays are tracers there, and only there."""
+    return traced(jnp.zeros(()))
 
 
 def on_the_host() -> AbstractContextManager[Any]:

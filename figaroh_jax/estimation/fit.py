@@ -21,7 +21,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float
 
-from ..compiled.batching import DRAFT_OPTIONS, FEW, filtered_program, on_host, traced
+from ..compiled.batching import DRAFT_OPTIONS, FEW, filtered_program, on_host, staged, traced
 from ..compiled.precision import in_float64
 from ..effects.extended import ExtendedModel, extend
 from ..errors import InputError, check_count, check_real
@@ -128,7 +128,7 @@ def fit(
     problem = _Problem(whole, parts, precision, closed, chosen)
     if bounds is not None:
         return _bounded(problem, *_limits(chosen, bounds), max_steps)
-    if solver is None and closed is None and on_host(problem):
+    if solver is None and closed is None and on_host(problem) and not staged():
         return _descended(problem, max_steps)
     if solver is None:
         solver = BlockLevenbergMarquardt() if closed else optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
