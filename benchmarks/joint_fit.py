@@ -1,6 +1,7 @@
 """One fit of torques, postures and a rollout together: where its time goes, and how often intervals hold the truth.
 
     python benchmarks/joint_fit.py [--seeds 20] [--data torque postures rollout]
+    python benchmarks/joint_fit.py --programs      # first and second call of `rollout` and of `fit_linear`
 
 The arm and its recordings are MuJoCo C's (`tests/generators/joint_arm.py`). Prints CPU seconds of the first
 fit of the process, of those after it (other noise, same programs), their steps, and of the ten hidden numbers how many
@@ -45,15 +46,40 @@ def fitted(data: dict[str, Any], which: tuple[str, ...] = ("torque", "postures",
     return fj.fit(data["rollout"].model, [data[name] for name in which], free, prior={"inertia": 0.5})
 
 
+def programs(file: Path) -> None:
+    """CPU seconds of the first and the second call, for 400 steps of the arm and for 6 s of the demo's torques."""
+    loop, _ = fj.load_loop(file)
+    command = np.repeat(joint_arm.record(0).command, 2, 0)
+    robot, t = fj.load_urdf(fj.DEMO), np.arange(1500)[:, None] / 250.0
+    q, tau = 0.6 * np.sin(2 * np.pi * np.array([0.5, 0.7, 0.9, 1.1]) * t + np.arange(4)), np.cos(t + np.arange(4))
+    data = fj.torque_data(robot, fj.recording(q=q, tau=tau, rate=250), SETTINGS)
+    basis = fj.linear_basis(robot, data)
+    calls = {
+        "rollout": lambda: fj.rollout(loop, command, np.zeros(2)).position,
+        "fit_linear": lambda: fj.fit_linear(robot, data, basis).values,
+    }
+    for name, call in calls.items():
+        told = []
+        for _ in range(2):
+            start = time.process_time()
+            np.asarray(call())
+            told.append(time.process_time() - start)
+        print(f"{name}: first {told[0]:.2f} CPU s, second {told[1]:.3f} CPU s")
+
+
 def main() -> None:
     """Print times and pulls."""
-    asked = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    asked = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     asked.add_argument("--seeds", type=int, default=20)
     asked.add_argument("--data", nargs="+", default=["torque", "postures", "rollout"])
+    asked.add_argument("--programs", action="store_true")
     given, pulls, seconds = asked.parse_args(), [], []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "arm.xml"
         file.write_text(joint_arm.ARM.format(**joint_arm.NOMINAL))
+        if given.programs:
+            programs(file)
+            return
         for seed in range(given.seeds):
             data = prepared(file, joint_arm.record(seed))
             start = time.process_time()

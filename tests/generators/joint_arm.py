@@ -77,7 +77,8 @@ def _torques(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     state, t = mujoco.MjData(model), np.arange(2000)[:, None] / 250  # pyright: ignore[reportAttributeAccessIssue]
     rate, phase = 2 * np.pi * np.array([[0.37, 0.53], [0.71, 0.93]]), rng.uniform(0, 6, (2, 2))
     q, v, a = (
-        sum(0.4 * w**k * np.sin(w * t + p + k * np.pi / 2) for w, p in zip(rate, phase, strict=True)) for k in range(3)
+        np.sum([0.4 * w**k * np.sin(w * t + p + k * np.pi / 2) for w, p in zip(rate, phase, strict=True)], axis=0)
+        for k in range(3)
     )
     torque = np.zeros_like(q)
     for k in range(len(t)):
