@@ -226,9 +226,11 @@ def _limits(
     for name, some in (("lower", lower), ("upper", upper)):
         if some is not None and np.isnan(np.asarray(some, float)).any():
             raise InputError(f"{name} holds nan; a number is expected, or inf where there is no limit")
-    if (crossed := np.flatnonzero(np.asarray(low > high))).size:
-        k = int(crossed[0])
-        raise InputError(f"lower is above upper: {float(low[k]):g} and {float(high[k]):g} of the basis' name {k + 1}")
+    if lower is not None and upper is not None:  # in NumPy: a `jit` that holds neither may be at work
+        least, most = (np.broadcast_to(np.asarray(x, float), rank) for x in (lower, upper))
+        if (crossed := np.flatnonzero(least > most)).size:
+            k = int(crossed[0])
+            raise InputError(f"lower is above upper: {least[k]:g} and {most[k]:g} of the basis' name {k + 1}")
     finite = [np.broadcast_to(np.isfinite(np.asarray(x)), rank) for x in given]
     return low, high, np.flatnonzero(np.any(finite, axis=0)) if finite else np.zeros(0, int)
 
