@@ -406,6 +406,8 @@ def test_rows_of_json_with_a_scanner_are_rows(tmp_path: Path):
         ('{"q": [1], "q": [2]}', "the key 'q' appears twice"),
         ('{"q": [[1, 2], [3]]}', "'q', row 1 .from 0.: a list of 1, but a list of 2 in row 0"),
         ('{"q": [1, null, 2]}', "'q', row 1 .from 0.: an empty cell is not a number"),
+        ('[{"q": [1, 2]}, {"t": 1}, {"q": [1, 2]}]', "'q', row 1 .from 0.: no value stands there"),
+        ('[{"t": 0}, {"q": [1, 2]}]', "'q', row 0 .from 0.: no value stands there"),
         ('{"q": [1, "two"]}', "'q', row 1 .from 0.: 'two' is not a number"),
         ('{"rate": 250}', "holds no lists of numbers"),
         ("[" * 100_000, "too deep"),

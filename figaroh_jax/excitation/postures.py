@@ -269,6 +269,7 @@ class _Calibrated:
 
 def _check_instrument(one: Instrument) -> None:
     """Refuse what a device cannot be; its kind and frames are asked for where its rows are made."""
+    check_kind("instrument", one, Instrument, "Instrument('position', base_frame='base', tool_frame='hand'), say")
     check_accuracy(one.accuracy, may_lack=False)
     check_finite("point", one.point)
     if np.shape(one.point) != (3,):
@@ -322,13 +323,9 @@ def excite_postures(
     ((12, 4), True)
     """
     check_kind("model", model, RobotModel, "load_urdf reads one; an ExtendedModel holds one as `.robot`")
-    check_kind(
-        "instrument", instrument, Instrument, "Instrument('position', base_frame='base', tool_frame='hand'), say"
-    )
     _check_instrument(instrument)
-    check_count("count", count)
-    check_count("candidates", candidates)
-    check_count("seed", seed, 0)
+    for name, given, least in (("count", count, 1), ("candidates", candidates, 1), ("seed", seed, 0)):
+        check_count(name, given, least)
     check_one_of("level", level, get_args(Level))
     if clearance is not None:
         check_kind("clearance", clearance, Clearance, "`clearance_of` makes one")

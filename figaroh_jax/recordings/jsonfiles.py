@@ -41,6 +41,7 @@ def read_json(file: Path, source: Source) -> Table:
     elif source.episode is not None:
         raise InputError(f"{file}: holds one run; `episode` is for a list of them, objects of long lists each")
     else:
+        _parsed.cache_clear()
         columns = dict(_columns(found, ""))
     if not columns:
         raise InputError(
@@ -52,7 +53,10 @@ def read_json(file: Path, source: Source) -> Table:
     def read(name: str) -> np.ndarray:
         lengths = [len(cell) if isinstance(cell, list) else -1 for cell in columns[name]]
         odd = next((k for k, length in enumerate(lengths) if length != lengths[0]), None)
-        if odd is not None and None not in (columns[name][odd], columns[name][0]):
+        if odd is not None and None in columns[name]:
+            row = columns[name].index(None)
+            raise InputError(f"{file}: '{name}', row {row} (from 0): no value stands there; other rows have one")
+        if odd is not None:
             raise InputError(
                 f"{file}: '{name}', row {odd} (from 0): {_width(lengths[odd])}, but {_width(lengths[0])} in row 0"
             )
@@ -78,7 +82,7 @@ def _loaded(file: Path) -> Any:
     return _parsed(file, told.st_mtime_ns, told.st_size)
 
 
-@lru_cache(maxsize=1)  # each run of a list is asked for by itself
+@lru_cache(maxsize=1)  # each run of a list is asked for by itself; what is no such list is not kept
 def _parsed(file: Path, changed: int, size: int) -> Any:
     if size > LARGEST_JSON:
         raise InputError(
