@@ -30,6 +30,7 @@ from .shifts import links_torque, shift_torques, torque_change
 __all__ = [
     "BATCH",
     "Units",
+    "as_kind",
     "batch_size",
     "candidates",
     "fitted_fields",
@@ -98,6 +99,14 @@ def with_shape(effect: Effect, names: list[str], values: list) -> Effect:
     """The effect with the named parameters replaced."""
     other = object.__new__(type(effect))  # as `eqx.tree_at` makes it, which takes ten times as long
     for name, value in (vars(effect) | dict(zip(names, values, strict=True))).items():
+        object.__setattr__(other, name, value)
+    return other
+
+
+def as_kind(effect: Effect, kind_of: type[Effect]) -> Effect:
+    """The same numbers as an effect of another class with the same parameters."""
+    other = object.__new__(kind_of)
+    for name, value in vars(effect).items():
         object.__setattr__(other, name, value)
     return other
 

@@ -64,7 +64,7 @@ from .rest import (
     verdict,
     wrong_law,
 )
-from .screening import noise_squares
+from .screening import OneMore, noise_squares
 from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without, taken_beside
 from .setting import Setting, prepared_signals, setting_beside, setting_of
 from .standstill import left_moving, resting
@@ -589,11 +589,11 @@ def _answer(
         verdict=judged.word,
         causes=tuple(
             Cause(
-                one.name,
+                Name(*one.name),
                 estimates(effect, joint.fitted, joint.fitted.places[k], model),
                 one.confidence,
                 gain,
-                one.ambiguous,
+                tuple(dict.fromkeys(Name(*n) for n in one.ambiguous if tuple(n) != tuple(one.name))),
                 k + 1,
             )
             for k, one, effect, gain in zip(order, found, causes, gains, strict=True)
@@ -612,7 +612,7 @@ def _answer(
         traces=traces(problem, signals, first.state, last.state, joint.causes, named),
         baseline=fitted_model(problem, first.state, []),
         model=fitted_model(problem, last.state, joint.causes),
-        rest=judged.rest,
+        rest=replace(judged.rest, nearest=tuple(map(_told, judged.rest.nearest))),
         links=moved_links(problem, first, last, here.whitening, welded),
         notes=(
             *_notes(signals, here, last),
@@ -621,6 +621,12 @@ def _answer(
         ),
         prismatic=prismatic(model),
     )
+
+
+def _told(near: Nearest) -> Nearest:
+    if not isinstance(near.name, OneMore):
+        return near
+    return replace(near, name=Name(*near.name), why_not=f"one more of it at that place: {near.why_not}")
 
 
 _NEEDLESS = "beside the other causes it predicts nothing more of the held-out data: they explain the same misfit"

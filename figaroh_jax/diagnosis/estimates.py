@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ..effects.base import Effect, Motion, joint_unit
+from ..effects.catalogue import find
 from ..effects.extended import ExtendedModel, extend
 from ..recordings.stacked import filtered_rows
 from ..results import Estimate
 from ..rigid.model import RobotModel, prismatic
-from .design import Units, fitted_fields, kind, local, sensor_response, shapes, unit_rows, with_shape
+from .design import Units, as_kind, fitted_fields, kind, local, sensor_response, shapes, unit_rows, with_shape
 from .problem import Problem
 from .shifts import torque_change
 from .state import State, unit_slopes
@@ -99,7 +100,9 @@ def fitted_model(problem: Problem, state: State, causes: list[Effect]) -> Extend
             column += len(names)
             if (term.name, tuple(one.at)) not in known:
                 effects.append(with_shape(one, names, values))
-    return extend(robot, *effects, *with_amplitudes(state, causes), width=problem.width)
+    effects += with_amplitudes(state, causes)
+    told = (as_kind(e, find(e.one_more_of)) if e.one_more_of else e for e in effects)
+    return extend(robot, *told, width=problem.width)
 
 
 def _without(state: State, effect: Effect) -> Motion:

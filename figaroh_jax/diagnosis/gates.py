@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 
 from ..effects.base import Effect, Parameter
@@ -11,10 +12,11 @@ from .comparison import Verdicts, overlap, t_value
 from .contenders import Contender
 from .problem import Problem
 from .screening import Screen
+from .state import State
 from .step import Step
 from .thresholds import GAIN, OVERLAP_SAME, SIZE_REGION, T_ALIKE, T_APART, T_BETTER
 
-__all__ = ["ambiguous", "exists", "gains", "holds", "passes", "physical_sign", "rivals", "simpler"]
+__all__ = ["ambiguous", "apart", "exists", "gains", "holds", "passes", "physical_sign", "rivals", "simpler"]
 
 
 def exists(problem: Problem, effect: Effect) -> bool:
@@ -41,6 +43,18 @@ def exists(problem: Problem, effect: Effect) -> bool:
         return True
     # one that passes, or that only slow motion shows, may be larger than the joint's torque on average
     return max(forces) <= np.abs(problem.torque[..., int(effect.at[0])]).max()
+
+
+def apart(problem: Problem, state: State, effect: Effect) -> bool:
+    """Whether one more effect of a place differs enough from the one that is there; whatever is none of that does."""
+    first, at = type(effect).one_more_of, np.asarray(effect.at)
+    there = [
+        jax.tree.map(lambda x, k=k: np.asarray(x)[k], term)
+        for term in state.terms
+        if first and term.name == first
+        for k in np.flatnonzero((np.asarray(term.at) == at).all(1))
+    ]
+    return all(effect.apart_from(other, *problem.reached) for other in there)
 
 
 def physical_sign(effect: Effect) -> bool:

@@ -219,8 +219,9 @@ def traces(
     """Each recording's rows: measured torque, the model's before and after, the share of each cause."""
     before, after = predicted(problem, first), predicted(problem, last)
     places = amplitude_places(last, causes)
-    shares = [_share(problem, last, e, at) for e, at in zip(causes, places, strict=True)]
-    out = []
+    shares, out = {}, []
+    for one, effect, at in zip(found, causes, places, strict=True):
+        shares[str(one.name)] = shares.get(str(one.name), 0.0) + _share(problem, last, effect, at)
     for one, at in zip(signals, problem.records.spans, strict=True):
         rows, here = one.rows.index, (at.slot, slice(at.row, at.row + at.rows))
         out.append(
@@ -233,7 +234,7 @@ def traces(
                 measured=None if one.torque is None else problem.torque[here],
                 before=before[here],
                 after=after[here],
-                shares={str(f.name): share[here] for f, share in zip(found, shares, strict=True)},
+                shares={name: share[here] for name, share in shares.items()},
                 counted=np.asarray(one.rows.weight) > 0,
             )
         )

@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..effects.base import Effect
-from ..effects.catalogue import CATALOGUE, related
+from ..effects.catalogue import CATALOGUE, one_more, related
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Linear, Rows
 from ..results import Name
 from ..rigid.model import RobotModel
 from .bank import Bank, Columns, bank
-from .design import Units, flattened, kind, local, unit_rows, units
+from .design import Units, as_kind, flattened, kind, local, unit_rows, units
 from .evidence import Score, block_scores, largest, other_scores, projection, pulled, scores
 from .problem import Problem, without_factor
 from .state import State, batched, unit_torques
@@ -29,6 +29,7 @@ __all__ = [
     "CHUNK",
     "Group",
     "Null",
+    "OneMore",
     "Screen",
     "Shown",
     "catalogue",
@@ -44,6 +45,21 @@ DRAWS, CHUNK = 400, 50  # draws, and how many are made at once
 LOCAL_DRAWS = 4000  # where each place is asked for itself, and counted as one of many
 FAR = 3.0  # times the largest score of a part's noise: a score from which no further noise is asked for
 KEPT = 16_000_000  # numbers of noise that are held from step to step
+
+
+class OneMore(Name):
+    """The name of one more effect of a place: written as that of the first, and not equal to it."""
+
+    __slots__ = ()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, OneMore) and tuple(self) == tuple(other)
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
+    def __hash__(self) -> int:
+        return hash((OneMore, *self))
 
 
 class Group(NamedTuple):
@@ -113,18 +129,19 @@ def catalogue(
     fresh = _fresh_columns(problem, state, whitening, wanted, None if before is None else turned)
     groups, joints, links = [], problem.model.joint_names, problem.model.link_names
     for name in (n for n in wanted if n in batches):
-        own = links if batches[name].acts_on == "link" else joints
+        own, more = links if batches[name].acts_on == "link" else joints, one_more(name)
         for place, at in enumerate(np.asarray(batches[name].at)[:, 0].tolist()):
-            title = Name(name, tuple(own[i] for i in at))
-            if (name, tuple(at)) in taken:
+            first, there = Name(name, tuple(own[i] for i in at)), (name, tuple(at)) in taken
+            if there and (more is None or (more.name, tuple(at)) in taken):
                 continue
-            known = old.get(title)
+            title = OneMore(*first) if there else first
+            known = old.get(title) or old.get(first)
             columns = fresh.get(name, {}).get(place, known.columns if known else None)
             if columns is None and batches[name].inertial:
                 columns = _link_columns(rows, at[0], problem.model)
             if columns is not None and columns.Z.any():
                 one = known.effect if known else jax.tree.map(lambda x, p=place: np.asarray(x)[p], batches[name])
-                groups.append(Group(title, one, columns))
+                groups.append(Group(title, as_kind(one, more) if there and more else one, columns))
     return groups
 
 

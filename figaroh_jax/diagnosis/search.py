@@ -21,7 +21,7 @@ from .design import kind
 from .estimates import amplitude_places, with_amplitudes
 from .evidence import block_scores
 from .flexible import friction_width
-from .gates import ambiguous, exists, gains, holds, passes, physical_sign, rivals, simpler
+from .gates import ambiguous, apart, exists, gains, holds, passes, physical_sign, rivals, simpler
 from .joint import polished
 from .problem import Problem
 from .screening import DRAWS, Null, Screen, Shown, catalogue, family_p, place_p, screen
@@ -264,7 +264,7 @@ def _contenders(
         one = contend(problem, step, whitening, base, ready, group, order, fitted)
         if not exists(problem, one.effect) and len(order := next_shape(group, one)):
             one = contend(problem, step, whitening, base, ready, group, order, fitted)
-        if exists(problem, one.effect):
+        if exists(problem, one.effect) and apart(problem, step.state, one.effect):
             out.append(one)
         else:
             fitted.pop(group.name, None)

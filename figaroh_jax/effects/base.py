@@ -323,6 +323,7 @@ class Effect(eqx.Module):
     contained_in: ClassVar[tuple[str, ...]] = ()  # the same from the other side, for an effect of yours: see `register`
     resembles: ClassVar[tuple[str, ...]] = ()  # simpler effects, anywhere, that it can all but imitate: see `gates`
     indistinguishable_from: ClassVar[tuple[str, ...]] = ()  # the same torque in a moving joint
+    one_more_of: ClassVar[str] = ""  # the effect of which a place has one already where this one is looked for
     excludes: ClassVar[tuple[str, ...]] = ()  # not looked for any more once this one has been accepted
     # what physics asks of it; for a single parameter see the bounds of `amplitude` and `shape`
     dissipative: ClassVar[bool] = False  # whether amplitudes below zero would feed energy to the robot
@@ -439,6 +440,10 @@ class Effect(eqx.Module):
     def starts(cls, motion: Motion, place: int) -> dict[str, tuple[float, ...]]:
         """Grids of shapes that depend on the recordings: their motion, its `total` the torque as measured."""
         return {}
+
+    def apart_from(self, other: Effect, low: Float[np.ndarray, " nv"], high: Float[np.ndarray, " nv"]) -> bool:
+        """Whether motion between the positions `low` and `high` tells it from the other of which it is one more."""
+        return True
 
     def shown_by(self, low: Float[np.ndarray, " nv"], high: Float[np.ndarray, " nv"]) -> bool:
         """Whether motion between the positions `low` and `high` can tell the effect from a smooth torque at all."""

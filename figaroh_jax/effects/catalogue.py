@@ -14,6 +14,6 @@ from . import (
     sensors as sensors,
     transmission as transmission,
 )
-from .registry import CATALOGUE, ROLLOUTS, find, register, related
+from .registry import CATALOGUE, ROLLOUTS, find, one_more, register, related
 
-__all__ = ["CATALOGUE", "ROLLOUTS", "find", "register", "related"]
+__all__ = ["CATALOGUE", "ROLLOUTS", "find", "one_more", "register", "related"]

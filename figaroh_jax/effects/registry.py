@@ -7,7 +7,7 @@ from typing import NoReturn
 from ..errors import InputError, nearest
 from .base import Effect
 
-__all__ = ["CATALOGUE", "POSES", "ROLLOUTS", "find", "register", "related"]
+__all__ = ["CATALOGUE", "POSES", "ROLLOUTS", "find", "one_more", "register", "related"]
 
 
 class UnknownEffect(InputError, KeyError):
@@ -73,6 +73,11 @@ def find(name: str) -> type[Effect]:
     if name not in known:
         raise UnknownEffect(f"no effect '{name}' in the catalogue{nearest(name, known)}")
     return known[name]
+
+
+def one_more(name: str) -> type[Effect] | None:
+    """What is looked for where an effect has been accepted: one more of it at the same place; None for most."""
+    return next((effect for effect in _OTHERS.values() if effect.one_more_of == name), None)
 
 
 def related(name: str, relation: str) -> tuple[str, ...]:

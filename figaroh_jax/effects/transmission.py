@@ -123,6 +123,24 @@ class TorqueRipple(JointEffect):
 
 
 @register
+class SecondRipple(TorqueRipple):
+    """One more wave at a joint that ripples: another stage of its gear, or twice a turn beside once a turn.
+
+    Told as a `TorqueRipple` of that joint, as the first one is.
+    """
+
+    name, title = "second_ripple", "second torque ripple"
+    one_more_of = "torque_ripple"
+    searched = False  # nor is it anything by itself
+    levels = ("torque",)
+
+    def apart_from(self, other: Effect, low: Float[np.ndarray, " nv"], high: Float[np.ndarray, " nv"]) -> bool:
+        """Whether the motion covers half a beat of the two; of closer orders the sum is one wave that grows or fades."""
+        order = other.order if isinstance(other, TorqueRipple) else 0.0
+        return bool(abs(float(self.order) - float(order)) * (high - low)[int(self.at[0])] > np.pi)
+
+
+@register
 class JointSpring(JointEffect):
     """A spring across the joint: a balancer, a cable, a hose."""
 

@@ -144,7 +144,10 @@ def _describe(
     robot: RobotModel, effect: Effect, causes: Sequence[Cause], in_urdf: Carried, in_mjcf: Carried
 ) -> dict[str, Any]:
     at = place_names(robot, effect)
-    known = next((c.parameters for c in causes if c.name == (effect.name, at)), {})
+    same = [c.parameters for c in causes if c.name == (effect.name, at)]
+    values = _physical(effect)
+    # a joint may have two of them
+    known = next((p for p in same if all(np.isclose(p[n].value, values[n]) for n in p)), (same or [{}])[0])
     answer = {
         "effect": effect.name,
         "at": list(at),
