@@ -48,6 +48,7 @@ EQUIVALENT = ({"torque_delay", "torque_lag"}, {"torque_offset", "asymmetric_coul
 
 Case = dict[str, Any]
 Name = tuple[str, tuple[str, ...]]
+Told = tuple[Name, dict[str, Any]]  # a cause of an answer
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,7 @@ def read(kept: Path) -> dict[str, Any] | None:
     return json.loads(file.read_text()) if file.is_file() else None
 
 
-def causes(answer: dict[str, Any]) -> list[tuple[Name, dict[str, Any]]]:
+def causes(answer: dict[str, Any]) -> list[Told]:
     """What an answer names; `unknown` and `nothing` name nothing."""
     if answer["verdict"] not in ("named", "named+rest"):
         return []
@@ -224,18 +225,25 @@ class Grade:
     inside: tuple[bool, ...] = ()  # whether the interval of each parameter holds the truth
 
 
+_NONE = (None, None)
+
+
 def grade(case: Case, answer: dict[str, Any] | None, twin: dict[str, Any] | None) -> Grade:
     """Compare what is new in an answer with what was hidden."""
     if answer is None or (case.get("twin") and twin is None):
         return Grade("failed")
-    before = dict(causes(twin)) if twin else {}
+    before = causes(twin) if twin else []
     told = causes(answer)
-    new = [(n, c) for n, c in told if not any(n[1] == o[1] and same_effect(n[0], o[0]) for o in before)]
+    new = _more_than(told, before)
     truths = case["truth"]
     hits, sizes, inside = [], [], []
     for truth in truths:
-        hit = next((c for n, c in new if accepts(truth, n)), None)
-        old = next((c for n, c in before.items() if accepts(truth, n)), None)
+        name, hit = min(
+            ((n, c) for n, c in new if accepts(truth, n)), key=lambda t: _distance(t[1], truth), default=_NONE
+        )
+        # one more of what the twin has is all new, and not its growth
+        olds = (c for n, c in before if accepts(truth, n) and n != name)
+        old = min(olds, key=lambda c: _distance(c, truth), default=None)
         if hit is None and old is not None:
             hit = next((c for n, c in told if accepts(truth, n) and _grown(truth, c, old)), None)
         hits.append(hit)
@@ -243,13 +251,37 @@ def grade(case: Case, answer: dict[str, Any] | None, twin: dict[str, Any] | None
             sizes.append(size_error(truth, hit, old))
             inside += _inside(truth, hit) if old is None else []
     told_before = _alternatives(twin)  # the twin's answer left it open whether it is this
-    false = [(n, c) for n, c in new if n not in told_before and not any(accepts(t, n) for t in truths)]
+    again = {n for n, c in new if any(c is hit for hit in hits)}  # that a truth has taken: one more of it is none
+    spare = [(n, c) for n, c in new if not any(c is hit for hit in hits)]
+    open_ = [(n, c) for n, c in spare if n in again or not any(accepts(t, n) for t in truths)]
+    false = [(n, c) for n, c in open_ if n not in told_before]
     names, wrong = tuple(n for n, _ in new), tuple(n for n, _ in false)
     if truths and all(h is not None for h in hits):
         return Grade("more" if wrong else "right", names, wrong, tuple(sizes), tuple(inside))
     if any(_in_set(t, c) for t in truths for _, c in false):
         return Grade("set", names, tuple(n for n, c in false if not any(_in_set(t, c) for t in truths)))
     return Grade("wrong" if false else "silent", names, wrong)
+
+
+def _more_than(told: list[Told], before: list[Told]) -> list[Told]:
+    """The causes that a twin's answer lacks; of one more of what it has, that which is least like the twin's."""
+    new = [(n, c) for n, c in told if not any(n[1] == o[1] and same_effect(n[0], o[0]) for o, _ in before)]
+    for name in dict.fromkeys(n for n, _ in before):
+        more = [c for n, c in told if n == name]
+        for old in (c for n, c in before if n == name):
+            if more:
+                more.pop(min(range(len(more)), key=lambda k: _distance(more[k], old)))
+        new += [(name, c) for c in more]
+    return new
+
+
+def _distance(one: dict[str, Any], other: dict[str, Any]) -> float:
+    """How much the numbers that two causes (or a cause and a truth) share differ, relative."""
+    a, b = (
+        {k: float(v["value"] if isinstance(v, dict) else v) for k, v in c["parameters"].items()} for c in (one, other)
+    )
+    shared = [k for k in a.keys() & b.keys() if np.isfinite(a[k] - b[k])]
+    return sum(abs(a[k] - b[k]) / max(abs(a[k]), abs(b[k]), 1e-12) for k in shared) if shared else np.inf
 
 
 def _alternatives(twin: dict[str, Any] | None) -> set[Name]:

@@ -30,6 +30,8 @@ def answer(*causes: tuple[str, list[str], dict[str, float]], verdict: str = "nam
     return {"verdict": verdict, "causes": told, "p_value": 0.001}
 
 
+OWN = ("torque_ripple", ["j1"], {"sine": 1.0, "cosine": 0.5, "order": 4.0})
+HIDDEN = ("torque_ripple", ["j1"], {"sine": 3.3, "cosine": 4.4, "order": 9.1})
 SPRING = ("joint_spring", ["j1"], {"stiffness": 2.0, "rest": 0.0})
 
 
@@ -47,6 +49,12 @@ SPRING = ("joint_spring", ["j1"], {"stiffness": 2.0, "rest": 0.0})
         (TRUTH, answer(("torque_delay", [], {"delay": 0.03})), answer(("torque_delay", [], {"delay": 0.03})), "silent"),
         (RIPPLE, answer(("torque_ripple", ["j2"], {"sine": 3.0, "cosine": 4.0, "order": 9.0})), answer(), "wrong"),
         (TRUTH, None, answer(), "failed"),
+        # one more ripple of a joint is new, whichever stands first, and one more than there is is wrong
+        (RIPPLE, answer(OWN, HIDDEN), answer(OWN), "right"),
+        (RIPPLE, answer(HIDDEN, OWN), answer(OWN), "right"),
+        (RIPPLE, answer(OWN, HIDDEN), answer(OWN, HIDDEN), "silent"),
+        (RIPPLE, answer(OWN, HIDDEN), answer(), "more"),
+        (TRUTH, answer(OWN, HIDDEN), answer(OWN), "wrong"),
     ],
 )
 def test_an_answer_is_graded_by_what_its_twin_does_not_say(truth: Any, told: Any, twin: Any, grade: str):
@@ -64,6 +72,11 @@ def test_sizes_are_amplitudes_whatever_the_phase_and_the_twin_s_are_subtracted()
     assert blackbox.grade({"truth": [RIPPLE]}, found, None).sizes == pytest.approx((0.1,), rel=0, abs=1e-12)
     late, twin = ({"parameters": {"delay": {"value": x}}} for x in (0.031, 0.02))
     assert blackbox.size_error(TRUTH, late, twin) == pytest.approx(0.1, rel=0, abs=1e-9)
+
+
+def test_the_size_of_one_more_ripple_is_its_own():
+    graded = blackbox.grade({"truth": [RIPPLE], "twin": "t"}, answer(OWN, HIDDEN), answer(OWN))
+    assert graded.sizes == pytest.approx((0.1,), rel=0, abs=1e-9)
 
 
 TOOL = """
