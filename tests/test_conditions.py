@@ -25,9 +25,11 @@ from figaroh_jax.reporting.wording import sentence
 @pytest.mark.parametrize(
     ("seed", "strange"),
     [
-        (5021, False),  # a link's inertia: noise of 10 % in the band of a slow motion, 4096 counts
+        pytest.param(
+            5021, False, marks=pytest.mark.slow
+        ),  # a link's inertia: noise of 10 % in the band of a slow motion, 4096 counts
         pytest.param(21003, False, marks=pytest.mark.slow),  # a ripple: 4 s of slow noise
-        (21057, False),  # unknown: friction turns between samples 20 ms apart
+        pytest.param(21057, False, marks=pytest.mark.slow),  # unknown: friction turns between samples 20 ms apart
         (1007, True),  # unknown: 60 Hz with stamps in whole milliseconds
         pytest.param(
             4128483, False, marks=pytest.mark.slow
@@ -39,7 +41,7 @@ from figaroh_jax.reporting.wording import sentence
         pytest.param(
             4129578, True, marks=pytest.mark.slow
         ),  # unknown: repeats with a torque of ten bits, whose steps repeat
-        (971272111, True),  # unknown: a known payload was taken for a wrong clock
+        pytest.param(971272111, True, marks=pytest.mark.slow),  # unknown: a known payload was taken for a wrong clock
     ],
 )
 def test_a_right_model_is_told_so(seed: int, strange: bool) -> None:

@@ -42,7 +42,8 @@ def scores(text: str, noise: Literal["white", "coloured"], runs: int, folder: Pa
     return np.array(out)
 
 
-@pytest.mark.parametrize("noise", [pytest.param("white", marks=pytest.mark.slow), "coloured"])
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", ["white", "coloured"])
 def test_intervals_cover_in_a_few_runs(noise: Literal["white", "coloured"], tmp_path: Path):
     covered = np.mean(np.abs(scores(SHORT, noise, 12, tmp_path)) < 1.96)
     assert 0.87 <= covered <= 1.0

@@ -65,8 +65,8 @@ def test_rows_at_a_limit_are_the_derivatives_of_what_the_drive_gives(tmp_path: P
     "size, at, trajectories, seed",
     [
         (0.12, "joint_4", 2, secrets.randbits(31)),
-        (0.03, "joint_5", 4, secrets.randbits(31)),
-        (0.03, "joint_5", 4, 1456421666),
+        pytest.param(0.03, "joint_5", 4, secrets.randbits(31), marks=pytest.mark.slow),
+        pytest.param(0.03, "joint_5", 4, 1456421666, marks=pytest.mark.slow),
     ],
     ids=["half of the time at its limit", "seldom at its limit", "at its limit where recordings end"],
 )

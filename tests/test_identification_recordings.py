@@ -42,9 +42,10 @@ def test_tx40_cross_validated_error_beats_figaroh(gated: bool, limit: float, dat
     assert physical(found) and pooled(found.fit) <= 1.01 * pooled(found.unconstrained)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "backend",
-    ["mujoco", pytest.param("pinocchio", marks=pytest.mark.slow), pytest.param("mjx", marks=pytest.mark.slow)],
+    ["mujoco", "pinocchio", "mjx"],
 )
 def test_every_backend_identifies_the_same_parameters(backend: str, data_dir: Path, folder: Path):
     want, got = tx40(folder, data_dir), tx40(folder, data_dir, backend=backend)
@@ -60,6 +61,7 @@ def test_every_backend_identifies_the_same_parameters(backend: str, data_dir: Pa
         np.testing.assert_allclose(left, right, rtol=1e-6, atol=1e-6, err_msg=str(one.name))
 
 
+@pytest.mark.slow
 def test_tiago_arm_predicts_the_last_part_of_its_recording(data_dir: Path, tmp_path: Path):
     """figaroh: 1.028 N m (1.024 weighted)."""
     found = identify_task(fj.load_task(real_tasks.tiago_task(tmp_path, data_dir)))
@@ -68,6 +70,7 @@ def test_tiago_arm_predicts_the_last_part_of_its_recording(data_dir: Path, tmp_p
     assert physical(found) and pooled(found.fit) <= 1.05 * pooled(found.unconstrained)
 
 
+@pytest.mark.slow
 def test_panda_predicts_the_last_part_of_its_recording(data_dir: Path, tmp_path: Path):
     found = identify_task(fj.load_task(real_tasks.panda_task(tmp_path, data_dir)))
     reached = np.array([0.996, 0.999, 0.999, 0.999, 0.995, 0.999, 0.97])

@@ -95,7 +95,7 @@ def sure(wrong: Wrong, found: Diagnosis, seed: int) -> set[Name]:
     return names
 
 
-@pytest.mark.parametrize("seed", [5, 8, 9])  # a body was found in their place
+@pytest.mark.parametrize("seed", [*(pytest.param(k, marks=pytest.mark.slow) for k in (5, 8)), 9])  # a body was found
 def test_rotors_of_all_drives_are_named_and_no_body_that_holds_them(seed: int, tmp_path: Path) -> None:
     wrong = wrong_links.rotors(tmp_path, seed)
     found = diagnosed(wrong)
@@ -112,7 +112,7 @@ def test_nothing_but_rotors_is_told_of_a_file_that_lacks_them(tmp_path: Path) ->
     assert wrong.told in named or told(found).moved[0].name in (wrong.told, *wrong.beside), (seed, found.links)
 
 
-@pytest.mark.parametrize("seed", [12, 13, 15, None])
+@pytest.mark.parametrize("seed", [12, *(pytest.param(k, marks=pytest.mark.slow) for k in (13, 15)), None])
 def test_a_load_is_no_rotor(seed: int | None, tmp_path: Path) -> None:
     """Without it the links would carry it, as well on what was left out, and far from where they are believed."""
     fixed, seed = seed is not None, secrets.randbits(31) if seed is None else seed
@@ -146,9 +146,8 @@ REAL = {  # what is known of the sets from elsewhere: see the README of each and
 }
 
 
-@pytest.mark.parametrize(
-    "name", ["tx40", *(pytest.param(name, marks=pytest.mark.slow) for name in ("panda", "dfki_double_pendulum"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["tx40", "panda", "dfki_double_pendulum"])
 def test_what_is_wrong_with_the_links_of_real_robots_files_is_told(name: str, data_dir: Path, tmp_path: Path) -> None:
     """The Panda's file has a hand that was not mounted, the pendulum's its inertias about the joints, as the set's own
     yml has them; the TX40's has no rotors."""

@@ -31,13 +31,14 @@ def loud(case: Case) -> np.ndarray:
     return np.sqrt(np.mean([(one["torque"] ** 2).mean(0) for one in case.recordings], axis=0))
 
 
+@pytest.mark.slow
 @needs_robots
 @pytest.mark.parametrize(
     "seed",
     [
         pytest.param(secrets.randbits(31), id="drawn"),
-        pytest.param(1325230507, id="slow end of a motion", marks=pytest.mark.slow),
-        pytest.param(539310508, id="creeps", marks=pytest.mark.slow),
+        pytest.param(1325230507, id="slow end of a motion"),
+        pytest.param(539310508, id="creeps"),
     ],
 )
 def test_the_noise_beside_a_large_ripple_is_that_of_its_sensor(seed: int):
@@ -74,6 +75,7 @@ def test_what_the_catalogue_lacks_is_not_told_as_noise(effect: str, at: tuple[st
     assert (np.abs(np.log(found.noise / clean.noise * loud(without) / loud(hidden))) < np.log(2.0)).all(), seed
 
 
+@pytest.mark.slow
 @needs_robots
 @pytest.mark.parametrize(
     "effect, seed, scale, colour, step",
@@ -81,7 +83,7 @@ def test_what_the_catalogue_lacks_is_not_told_as_noise(effect: str, at: tuple[st
         # nearly dependent columns of the rich model cancelled in the rows they were fitted to, and in no others
         pytest.param("clock_error", 3306761008, 2.0, "ar100", 1e-5, id="clock"),
         # a step beyond all torques leaves no slope to come back by; a power law of the speed was named
-        pytest.param("torque_saturation", 1786552537, 0.5, "white", 1e-5, id="limit", marks=pytest.mark.slow),
+        pytest.param("torque_saturation", 1786552537, 0.5, "white", 1e-5, id="limit"),
     ],
 )
 def test_what_a_fit_had_lost_is_named_and_sized(effect: str, seed: int, scale: float, colour: str, step: float):
@@ -93,11 +95,12 @@ def test_what_a_fit_had_lost_is_named_and_sized(effect: str, seed: int, scale: f
         assert abs(told[name].value - value) < 4.5 * told[name].std, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "seed", "scale", "colour"),
     [
         ("ur10e", 1654321527, 1.0, "white"),
-        pytest.param("panda", 28229906, 2.0, "ar100", marks=pytest.mark.slow),
+        ("panda", 28229906, 2.0, "ar100"),
     ],
 )
 def test_a_gear_on_which_the_link_swings_in_the_band_of_its_motion_is_named(
@@ -115,7 +118,8 @@ def test_a_gear_on_which_the_link_swings_in_the_band_of_its_motion_is_named(
     assert abs(size.value - truth.parameters["compliance"]) < 3 * size.std
 
 
-@pytest.mark.parametrize("robot", ["tx40", pytest.param("panda", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["tx40", "panda"])
 def test_a_torque_that_follows_other_joints_is_not_told_as_noise(robot: str):
     """36 s without repeats: a product of a position and a velocity of two other joints, which the catalogue lacks, was
     `nothing` in nine of nine cases of 5 and 15 %."""
@@ -163,13 +167,14 @@ def test_presliding_is_not_what_samples_make_of_friction():
     assert diagnosed(hidden, ["presliding"]).verdict == "unknown"
 
 
+@pytest.mark.slow
 @needs_robots
 @pytest.mark.parametrize(
     "size, seed",
     [
         pytest.param(0.2, secrets.randbits(31), id="drawn"),
-        pytest.param(0.12, 71, id="half as large", marks=pytest.mark.slow),
-        pytest.param(0.2, 1395646121, id="a rotor in its place", marks=pytest.mark.slow),
+        pytest.param(0.12, 71, id="half as large"),
+        pytest.param(0.2, 1395646121, id="a rotor in its place"),
     ],
 )
 def test_a_ripple_beside_joints_that_stick_is_not_told_as_noise(size: float, seed: int):
@@ -178,13 +183,15 @@ def test_a_ripple_beside_joints_that_stick_is_not_told_as_noise(size: float, see
     assert diagnosed(case, ["torque_ripple"]).verdict == "unknown", seed
 
 
+@pytest.mark.slow
 @needs_robots
-@pytest.mark.parametrize("seed", [2977292912, pytest.param(892567041, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [2977292912, 892567041])
 def test_friction_that_slides_is_that_of_the_rows_that_move(seed: int):
     """Beside rows at rest it had been told 2 to 5 % too small, and what moves was no longer explained: `unknown`."""
     assert diagnosed(make_stiction_case([], "tx40", repeats=1, trajectories=4, seed=seed)).verdict == "nothing"
 
 
+@pytest.mark.slow
 @needs_robots
 def test_a_link_of_which_no_number_is_known_is_no_cause():
     """A gain of joint 2 had been link 2, of which the mass was told as 0 +- 33 565 kg and none of the ten as surely
@@ -193,8 +200,9 @@ def test_a_link_of_which_no_number_is_known_is_no_cause():
     assert "link_inertia" not in [cause.name.effect for cause in diagnosed(case).causes]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not robots.available("ur10e"), reason="FIGAROH_JAX_DATA has no ur10e")
-@pytest.mark.parametrize("seed", [3002095554, pytest.param(1639379783, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [3002095554, 1639379783])
 def test_joints_that_break_loose_are_no_effect(seed: int):
     """The others' motion foretold a joint beside those that stick, in which nothing is missing: it had been `unknown`.
 

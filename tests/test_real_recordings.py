@@ -69,6 +69,7 @@ def test_the_error_on_recordings_kept_out_is_no_larger_than_that_of_identify(
     assert np.all(explained[: len(goals)] >= goals), explained
 
 
+@pytest.mark.slow
 def test_every_cause_that_the_search_found_is_named_or_told_with_the_reason_why_not(
     data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -65,6 +65,7 @@ def test_positions_that_shake_are_no_error_of_the_model():
     assert (found.before < 1.3 * sound.before).all(), seed
 
 
+@pytest.mark.slow
 @needs_robots
 def test_what_is_hidden_beside_positions_that_shake_is_named():
     _, bad, seed = drawn("rotor_inertia")

@@ -32,7 +32,7 @@ def _task(folder: Path, seed: int, rotor: float) -> Path:
     return folder / "task.yaml"
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_clean_short_recordings_have_no_rest(tmp_path: Path, seed: int) -> None:
     """24 of 24 such recordings were `unknown`: their noise was told as .6 of what it is."""
     found = fj.diagnose_task(fj.load_task(str(_task(tmp_path, 100 + seed, rotor=0.0))))

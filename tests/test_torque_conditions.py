@@ -31,11 +31,13 @@ from figaroh_jax.recordings.signals import prepare_all
     ("seed", "mark"),
     [
         pytest.param(2, "nothing", id="two joints that move one after another, stamps that shake"),
-        pytest.param(21, "nothing", id="joints that rest, one of them gated"),
+        pytest.param(21, "nothing", id="joints that rest, one of them gated", marks=pytest.mark.slow),
         pytest.param(38, "nothing", id="a joint about the vertical that rests: its torque is all friction"),
         pytest.param(94, "nothing", id="moves with rests, without a filter", marks=pytest.mark.slow),
-        pytest.param(104, "nothing", id="stamps that shake, a recording kept out"),
-        pytest.param(73, "nothing", id="an offset of the baseline, and a difference that takes it off"),
+        pytest.param(104, "nothing", id="stamps that shake, a recording kept out", marks=pytest.mark.slow),
+        pytest.param(
+            73, "nothing", id="an offset of the baseline, and a difference that takes it off", marks=pytest.mark.slow
+        ),
         pytest.param(70, "right", id="a coupling behind columns in another order", marks=pytest.mark.slow),
         pytest.param(33, "right", id="an offset of a joint that rests", marks=pytest.mark.slow),
     ],

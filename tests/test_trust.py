@@ -78,10 +78,11 @@ def test_trusted_links_are_those_that_fit_best_among_the_believed_ones(off: floa
     assert believed(loose, prior, sums) is prior
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not robots.available("ur10e"), reason="FIGAROH_JAX_DATA has no ur10e")
 @pytest.mark.parametrize(
     "seed, scale, colour, step",
-    [pytest.param(2606540122, 0.5, "pink", 1e-5, marks=pytest.mark.slow), (1335762658, 2.0, "ar20", 1e-4)],
+    [(2606540122, 0.5, "pink", 1e-5), (1335762658, 2.0, "ar20", 1e-4)],
 )
 def test_what_links_may_look_like_has_no_name_beside_links_that_would_move(
     seed: int, scale: float, colour: str, step: float

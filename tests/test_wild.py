@@ -113,7 +113,13 @@ def test_where_too_many_rows_are_wild_all_of_them_stay(run: tuple[RobotModel, Re
     assert wild_rows(spoiled(one, "torque", rows), robot) is None
 
 
-@pytest.mark.parametrize("effect", ["torque_saturation", "backlash", "presliding", "contact", "torque_ripple", None])
+@pytest.mark.parametrize(
+    "effect",
+    [
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("torque_saturation", "presliding")),
+        *("backlash", "contact", "torque_ripple", None),
+    ],
+)
 def test_right_recordings_have_no_wild_rows(effect: str | None, tmp_path: Path):
     case = make_case([(effect, 0.15)] if effect else [], robot="small", repeats=1, trajectories=2, seed=SEED)
     task = load_task(case.write(tmp_path))
@@ -122,7 +128,7 @@ def test_right_recordings_have_no_wild_rows(effect: str | None, tmp_path: Path):
 
 def test_a_drive_that_sticks_at_reversals_has_no_wild_rows(tmp_path: Path):
     """MuJoCo C in closed loop: quantised encoders, noise of the current, dry friction that holds."""
-    task = load_task(make_closed_loop_case([], robot="small", seed=SEED).write(tmp_path))
+    task = load_task(make_closed_loop_case([], robot="small", repeats=1, trajectories=2, seed=SEED).write(tmp_path))
     assert not any(one.wild for one in read_recordings(task, load_robot(task))), SEED
 
 
@@ -161,7 +167,7 @@ def test_rows_are_told_as_the_file_counts_them(run: tuple[RobotModel, Recording]
     assert f"in row {stop} " in told, (SEED, told)
 
 
-@pytest.mark.parametrize("kind", FOUND)
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind != "lost")) for kind in FOUND])
 def test_a_fit_is_that_of_the_recording_without_these_rows(kind: str, tmp_path: Path):
     case = make_case([], robot="small", repeats=1, trajectories=2, seed=SEED)
     paths = [case.write(tmp_path / name) for name in ("spoiled", "by_hand")]
