@@ -139,18 +139,18 @@ def test_a_link_of_an_arm_whose_centre_of_mass_lies_elsewhere_is_told(tmp_path: 
     assert abs(sizes(found)["link_inertia", link]["mx"] - moment) < 0.02 * moment, seed
 
 
-def test_numbers_of_links_stay_with_them_beside_a_spring(tmp_path: Path):
+@pytest.mark.parametrize("joint", [pytest.param(0, marks=pytest.mark.slow), 1])
+def test_numbers_of_links_stay_with_them_beside_a_spring(tmp_path: Path, joint: int):
     """MuJoCo's arm with a hinge that is all but stiff is the arm without: so is ours, whatever its links carry."""
     (tmp_path / "arm.xml").write_text(servo_arm6.model_text())
     loop, _ = load_loop(tmp_path / "arm.xml")
     table, sizes = (Entry("payload", (3,)), Entry("mass_x", (1,))), np.array([0.2, 0.05])
     u = servo_arm6.command(3, 0)[:600]
     rigid, bare = (np.asarray(fj.rollout(x, u, u[0]).reading) for x in (put(loop, table, sizes), loop))
-    for joint in (0, 1):
-        soft, more = elastic_loop(loop, joint, 3e4, 10.0), elastic_table(loop, table, joint)
-        new = put(soft, more, np.append(sizes, [3e4, 10.0, 0.0]))
-        read = np.asarray(fj.rollout(new, u, np.append(u[0], 0.0)).reading)[:, :6]
-        assert np.abs(read - rigid).max() < 0.05 * np.abs(rigid - bare).max()
+    soft, more = elastic_loop(loop, joint, 3e4, 10.0), elastic_table(loop, table, joint)
+    new = put(soft, more, np.append(sizes, [3e4, 10.0, 0.0]))
+    read = np.asarray(fj.rollout(new, u, np.append(u[0], 0.0)).reading)[:, :6]
+    assert np.abs(read - rigid).max() < 0.05 * np.abs(rigid - bare).max()
 
 
 @pytest.mark.parametrize("told", [("mass_z", "inertia_xx"), ("mass", "mass_z", "inertia_xx")])
@@ -201,12 +201,12 @@ def test_identify_tells_the_links_that_a_task_names(tmp_path: Path):
     np.testing.assert_allclose(result["fit"]["rms"], NOISE, atol=0.1 * NOISE)
 
 
-def _told_of_the_double_pendulum(folder: Path, held: tuple[int, ...]) -> dict[str, Any]:
-    """The answer by six recordings, some of them `held` out."""
+def _told_of_the_double_pendulum(folder: Path, count: int, held: tuple[int, ...]) -> dict[str, Any]:
+    """The answer by the first recordings, some of them `held` out."""
     own = DATA / "dfki_double_pendulum"
     data = [
         {"file": str(f), "time": "t", "command": "tau", "position": "q", "role": "holdout" if k in held else "fit"}
-        for k, f in enumerate(sorted(own.glob("C1_*.npz"))[:6])
+        for k, f in enumerate(sorted(own.glob("C1_*.npz"))[:count])
     ]
     task = {
         "robot": {"model": str(own / "double_pendulum_C1.urdf")}, "data": data, "rollout": {"window": 0.3},
@@ -217,10 +217,11 @@ def _told_of_the_double_pendulum(folder: Path, held: tuple[int, ...]) -> dict[st
     return json.loads((folder / "out" / "answer.json").read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (DATA / "dfki_double_pendulum").is_dir(), reason="FIGAROH_JAX_DATA is not there")
 def test_the_real_double_pendulum_has_its_inertia_about_its_joints(tmp_path: Path):
     """The set's own identified parameters (I1, I2 about the joints) stand in its URDF as about the centres of mass."""
-    answer = _told_of_the_double_pendulum(tmp_path, held=(5,))
+    answer = _told_of_the_double_pendulum(tmp_path, 6, held=(5,))
     assert answer["verdict"] == "named+rest"
     told = {tuple(c["at"]): c for c in answer["causes"] if c["effect"] == "link_inertia"}
     assert set(told) == {("Link1",), ("Link2",)}
@@ -231,13 +232,16 @@ def test_the_real_double_pendulum_has_its_inertia_about_its_joints(tmp_path: Pat
     assert sum("judged in windows of 0.3 s" in note for note in answer["notes"]) == 1
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not (DATA / "dfki_double_pendulum").is_dir(), reason="FIGAROH_JAX_DATA is not there")
-def test_links_that_too_few_recordings_bear_out_are_what_came_nearest(tmp_path: Path):
-    answer = _told_of_the_double_pendulum(tmp_path, held=(2, 5))
+@pytest.mark.parametrize(("count", "held"), [(4, (3,)), pytest.param(6, (2, 5), marks=pytest.mark.slow)])
+def test_links_that_too_few_recordings_bear_out_are_what_came_nearest(
+    tmp_path: Path, count: int, held: tuple[int, ...]
+):
+    answer = _told_of_the_double_pendulum(tmp_path, count, held)
     nearest = {tuple(one["at"]): one for one in answer["rest"]["nearest"] if one["effect"] == "link_inertia"}
     assert answer["verdict"] == "unknown" and set(nearest) == {("Link1",), ("Link2",)}
     assert {one["why_not"] for one in nearest.values()} == {"not as good in all recordings"}
+    assert sum("judged in windows of 0.3 s" in note for note in answer["notes"]) == 1
 
 
 def test_windows_of_a_robot_that_nothing_brings_back_begin_where_it_was_measured(tmp_path: Path):

@@ -98,7 +98,7 @@ def test_the_exported_files_start_and_move_as_the_original(root: str, integrator
     assert abs(first.joint("finger").qpos[0] - 0.3) > 0.1
 
 
-@pytest.mark.parametrize("play", [0.0, 0.03])
+@pytest.mark.parametrize("play", [pytest.param(0.0, marks=pytest.mark.slow), 0.03])
 def test_a_spring_between_motor_and_link_is_written_and_read_back(play: float, tmp_path: Path):
     """The written MJCF has motor and link, the URDF the rigid robot; what comes back moves as MuJoCo C moves that."""
     (tmp_path / "arm.xml").write_text(TWO)

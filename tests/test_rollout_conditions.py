@@ -26,13 +26,25 @@ DRIVES = ("position", "position", "limited", "geared", "general", "stated")
     ("seed", "most", "effects", "drives", "mark"),
     [
         pytest.param(30024, 3, [], DRIVES, "nothing", id="a counter that stands between steps"),
-        pytest.param(30022, 3, [], DRIVES, "right", id="friction, joints that move one after another"),
+        pytest.param(
+            30022,
+            3,
+            [],
+            DRIVES,
+            "right",
+            id="friction, joints that move one after another",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(30052, 3, [], DRIVES, "right", id="a tilt behind a drive that saturates"),
-        pytest.param(32002, 3, ["nothing"], ("limited",), "nothing", id="drives that saturate"),
-        pytest.param(40210, 4, [], DRIVES, "nothing", id="a baseline that ends early"),
-        pytest.param(41206, 4, [], DRIVES, "right", id="a tilt that shows along the joint's axis too"),
+        pytest.param(32002, 3, ["nothing"], ("limited",), "nothing", id="drives that saturate", marks=pytest.mark.slow),
+        pytest.param(40210, 4, [], DRIVES, "nothing", id="a baseline that ends early", marks=pytest.mark.slow),
+        pytest.param(
+            41206, 4, [], DRIVES, "right", id="a tilt that shows along the joint's axis too", marks=pytest.mark.slow
+        ),
         pytest.param(31007, 2, ["payload"], PLAIN, "right", id="a load at the tip, with its own inertia"),
-        pytest.param(31019, 2, ["payload"], PLAIN, "right", id="a load that three causes imitate"),
+        pytest.param(
+            31019, 2, ["payload"], PLAIN, "right", id="a load that three causes imitate", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_a_strangers_rollout_gets_its_cause(seed: int, most: int, effects: list[str], drives: list[str], mark: str):

@@ -220,6 +220,10 @@ def test_a_payload_that_rests_on_known_gains_says_so(tmp_path: Path):
 
 def test_identify_says_that_free_gains_are_not_fitted_unless_named(tmp_path: Path):
     path = task(tmp_path, "none", "actuator: {gains: free}\n")
+    for file in tmp_path.glob("*.npz"):
+        with np.load(file) as z:
+            arrays = {name: z[name][: len(z[name]) // 3] for name in z.files}
+        np.savez(file, **arrays)
     for more, said in (("", True), ("baseline: {effects: [{effect: actuator_gain, at: [joint]}]}\n", False)):
         (tmp_path / "two.yaml").write_text(path.read_text() + more)
         assert main(["identify", str(tmp_path / "two.yaml"), "--out", str(tmp_path / f"run{said}"), "--quiet"]) == 0
@@ -261,13 +265,20 @@ def test_files_of_the_other_format_and_a_run_for_its_model_are_told(tmp_path: Pa
         fj.load_model(tmp_path / "run")
 
 
+SLIDER = """<mujoco model="lamp"><option timestep="0.002" integrator="implicitfast"><flag contact="disable"/></option>
+<worldbody><body pos="0 0 .1"><joint name="yaw" axis="0 0 1" armature=".03" damping=".6" frictionloss=".15"/>
+<inertial pos="0 .01 .02" mass=".25" diaginertia="3e-4 3e-4 2e-4"/><body pos="0 0 .06">
+<joint name="left" type="slide" axis="0 1 0" damping="4" armature=".05" frictionloss=".5"/>
+<inertial pos="0 0 .02" mass=".02" diaginertia="1e-5 1e-5 1e-5"/></body></body></worldbody>
+<actuator><position joint="yaw" kp="25" kv="1"/><position joint="left" kp="300" kv="20"/></actuator></mujoco>"""
+
+
 def test_a_joint_that_slides_has_its_own_units_in_file_and_page(tmp_path: Path):
-    """A gripper beside joints that turn: N s/m in its cell, not at the head of the column for all."""
-    slides = GRIPPING.replace('damping="4"', 'damping="4" armature=".05" frictionloss=".5"')
-    (tmp_path / "arm.xml").write_text(slides)
-    t, u, q = moved(slides, 200)
-    noise = np.random.default_rng(1).normal(0, 1, q.shape) * [3e-4, 3e-4, 3e-5]
-    np.savez(tmp_path / "run.npz", t=t, u=u[:, [1, 2, 0]], q=q + noise)
+    """A gripper beside a joint that turns: N s/m in its cell, not at the head of the column for all."""
+    (tmp_path / "arm.xml").write_text(SLIDER)
+    t, u, q = moved(SLIDER, 200)
+    noise = np.random.default_rng(1).normal(0, 1, q.shape) * [3e-4, 3e-5]
+    np.savez(tmp_path / "run.npz", t=t, u=u, q=q + noise)
     (tmp_path / "task.yaml").write_text(
         "robot: {model: arm.xml}\ndata: [{file: run.npz, time: t, command: u, position: q}]\n"
     )
@@ -279,7 +290,7 @@ def test_a_joint_that_slides_has_its_own_units_in_file_and_page(tmp_path: Path):
     page = (tmp_path / "run" / "report.html").read_text()
     head = page[page.index("<thead>") : page.index("</thead>")]
     body = page[page.index("</thead>") : page.index("</table>")]
-    assert "N s/m" not in head and "N m s/rad" not in head and body.count("N s/m") == 1 and body.count("N m s/rad") == 2
+    assert "N s/m" not in head and "N m s/rad" not in head and body.count("N s/m") == 1 and body.count("N m s/rad") == 1
 
 
 def stepped(rows: int = 400, steps: int = 10) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from figaroh_jax.rollouts.loop import Loop, State, advance, mobility
 from figaroh_jax.rollouts.parameters import Entry, values
 from figaroh_jax.rollouts.reading import load_loop
 
-STEPS, SAMPLES = 6, 5
+STEPS, SAMPLES = 3, 5
 CHAIN = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/>
 <worldbody>{}</worldbody><actuator>{}</actuator></mujoco>"""
 

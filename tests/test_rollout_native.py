@@ -31,8 +31,14 @@ LIMITS = 'range="-.15 .2" limited="true" margin=".01"'
 WEAK = 'actuatorfrcrange="-12 9"'  # N m of all drives of a joint together
 
 
-@pytest.mark.parametrize("integrator", ["implicitfast", "Euler", "explicit"])
-@pytest.mark.parametrize("more", ["", LIMITS, WEAK])
+@pytest.mark.parametrize(
+    ("integrator", "more"),
+    [
+        pytest.param(one, more, marks=[pytest.mark.slow] * ((a - b) % 3 > 0))
+        for a, one in enumerate(("implicitfast", "Euler", "explicit"))
+        for b, more in enumerate(("", LIMITS, WEAK))
+    ],
+)
 def test_seven_joints_with_friction_and_limits_are_mujocos(tmp_path: Path, integrator: str, more: str):
     text = chain(7, integrator, more) if integrator != "explicit" else explicit(chain(7, "Euler", more))
     path = written(tmp_path, text)
@@ -143,7 +149,7 @@ def test_derivatives_with_coloured_noise_are_those_of_differences(tmp_path: Path
     checked(loop, table, np.array([0.3, 0.01, 0.0043]), data, np.asarray(data.start))
 
 
-@pytest.mark.parametrize("elastic", [False, True])
+@pytest.mark.parametrize("elastic", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_derivatives_of_a_carried_joint_are_those_of_differences(tmp_path: Path, elastic: bool):
     loop, run = arm(tmp_path)
     small, (mine,) = alone(loop, [run], carried_by(loop, [run]), 2)

@@ -167,7 +167,7 @@ def test_a_registered_effect_is_identified_and_exported(
     known: type[fj.Effect], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     """Its numbers by the command line; the files move MuJoCo as it moved, once its torque is said there too."""
-    u = command(3000)
+    u = command(2000)
     q = simulated_by_mujoco(u, 0.0, 0.0)
     (tmp_path / "servo.xml").write_text(SERVO.replace('frictionloss="0.15"', 'frictionloss="0.3"'))
     told = identified(tmp_path, q, "{effect: test_notch, at: [lift]}")
@@ -243,7 +243,7 @@ def test_what_a_step_does_not_know_is_refused(tmp_path: Path):
 def test_a_baseline_names_what_a_rollout_can_fit(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """An effect of the catalogue acts by its torque where the loop has no number for it; what has none is refused."""
     (tmp_path / "servo.xml").write_text(SERVO)
-    u = command(1500)
+    u = command(600)
     q = simulated_by_mujoco(u, 0.0, 0.0)
     task = recorded(tmp_path, q, "{effect: joint_elasticity, at: [lift]}")
     assert main(["identify", str(task), "--out", str(tmp_path / "out"), "--quiet"]) == 2
@@ -268,6 +268,7 @@ def test_a_base_that_is_not_level_is_identified(tmp_path: Path):
     assert y["status"] == "unidentifiable"  # along the axis of the joint
 
 
+@pytest.mark.slow
 def test_the_example_names_its_effect():
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     example = ROOT / "examples" / "own_rollout_effect.py"

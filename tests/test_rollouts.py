@@ -90,7 +90,9 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("integrator", ["implicitfast", pytest.param("Euler", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "integrator", [pytest.param(name, marks=pytest.mark.slow) for name in ("implicitfast", "Euler")]
+)
 def test_seven_joints_with_friction_are_mujocos(tmp_path: Path, integrator: str):
     path = written(tmp_path, chain(7, integrator))
     loop, notes = load_loop(path)
@@ -119,7 +121,8 @@ def test_cart_with_every_kind_of_actuator_is_mujocos(tmp_path: Path, integrator:
     np.testing.assert_allclose(rollout(loop, command, np.zeros(2)).position, truth, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("root", [pytest.param("", marks=pytest.mark.slow), "<freejoint/>"])
+@pytest.mark.slow
+@pytest.mark.parametrize("root", ["", "<freejoint/>"])
 def test_legs_with_limits_are_mujocos(tmp_path: Path, root: str):
     path = written(tmp_path, LEGS.replace("{root}", root).replace("{integrator}", "implicitfast"))
     loop, _ = load_loop(path)
@@ -148,7 +151,7 @@ FREE = '<joint type="free" armature=".2" damping=".1"/>'
     "root, integrator",
     [
         ("", "implicitfast"),
-        (FREE, "RK4"),
+        pytest.param(FREE, "RK4", marks=pytest.mark.slow),
         pytest.param("", "RK4", marks=pytest.mark.slow),
         pytest.param(FREE, "implicitfast", marks=pytest.mark.slow),
     ],
