@@ -11,6 +11,15 @@ import pytest
 import figaroh_jax as fj
 
 LONG = {"calibrate", "diagnose", "diagnose_task", "identify", "identify_task", "linear_basis", "linear_limits"}
+LONG |= {
+    "accelerators.fit_states",
+    "calibrate_task",
+    "expected_std",
+    "fit_linear",
+    "information",
+    "residual",
+    "screen_fleet",
+}
 LONG |= {"excite", "excite_postures", "excite_task", "write_report"}
 LONG |= {"rollout", "rollout_data", "select", "simulate", "triangular_factor"}
 FUNCTIONS = [n for n in fj.__all__ if callable(getattr(fj, n)) and not inspect.isclass(getattr(fj, n))]

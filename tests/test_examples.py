@@ -13,11 +13,15 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 ELSEWHERE = {"make_demo", "own_device", "own_effect", "own_rollout_effect"}
 SLOW = {
     "any_optimiser",
+    "batch",
     "calibrate_tracker",
     "design_a_motion",
     "diagnose_arrays",
+    "dynamics_and_gradients",
+    "fleet",
     "force_plate",
     "free_flyer",
+    "friction_by_gradient",
     "identify_arrays",
     "noisy_encoder",
     "own_friction",

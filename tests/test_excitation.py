@@ -306,6 +306,7 @@ def test_what_no_motion_meets_is_refused_with_the_joint_and_by_how_much(arm: Rob
         excite(arm, BASES[0], objective="prediction")
 
 
+@pytest.mark.slow
 def test_an_identification_from_the_designed_motion_predicts_better_than_from_random_ones(arm: RobotModel):
     """Torques are Pinocchio's with friction and noise; the fit is plain least squares in NumPy."""
     found = excite(arm, BASES[0], limits_of(arm, acceleration=8.0), starts=2, start=[0.1, 0.2])

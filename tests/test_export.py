@@ -105,7 +105,10 @@ def test_tiny_robots_reload_from_each_file(text: str, tmp_path: Path):
     assert_reloads(robots.load(text, tmp_path), tmp_path / "model")
 
 
-@pytest.mark.parametrize("name", robots.REAL)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name in ("panda", "talos", "tiago"))) for name in robots.REAL],
+)
 def test_real_robots_reload_from_each_file(name: str, data_dir: Path, tmp_path: Path):
     assert_reloads(load_urdf(data_dir / robots.REAL[name]), tmp_path)
     mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml"))

@@ -199,6 +199,7 @@ def test_one_fit_estimates_inertias_friction_placements_offsets_frames_and_gravi
     assert float(found.cost) < 0.6 * len(found.rows)  # half the squares of noise with one sigma
 
 
+@pytest.mark.slow
 def test_fits_of_many_runs_and_of_robots_of_one_structure_are_mapped(rubbing: fj.ExtendedModel):
     """One jitted call of `jax.vmap` gives what a loop gives."""
     runs = [moved_arm(rubbing, 0.1 * k) for k in range(3)]
@@ -228,8 +229,9 @@ def test_numbers_by_name_are_those_of_one_fit(rubbing: fj.ExtendedModel):
         jax.jit(lambda run: fj.fit(rubbing, run, "friction").parameters)(moved_arm(rubbing, 0.1))
 
 
+@pytest.mark.parametrize("kind", [pytest.param("torque", marks=pytest.mark.slow), "postures"])
 def test_plain_gradients_by_all_of_the_data_are_those_of_refits(
-    robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...], rubbing: fj.ExtendedModel
+    kind: str, robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...], rubbing: fj.ExtendedModel
 ):
     """No leaf is a whole number: `jax.grad` takes the data as they are."""
     run, (postures, *_) = moved_arm(rubbing), tracked
@@ -240,11 +242,15 @@ def test_plain_gradients_by_all_of_the_data_are_those_of_refits(
     def offset(data: fj.PoseData) -> jax.Array:
         return jnp.asarray(fj.fit(robot, data, {**JOINTS, "frames": True}).values)[0]
 
-    for fitted, data, leaf in ((damping, run, lambda d: d.torque), (offset, postures, lambda d: d.position)):
-        way = np.cos(np.arange(np.size(leaf(data)))).reshape(np.shape(leaf(data)))
-        sides = [fitted(eqx.tree_at(leaf, data, np.asarray(leaf(data)) + s * 1e-4 * way)) for s in (1, -1)]
-        slope = (np.asarray(leaf(jax.grad(fitted)(data))) * way).sum()
-        np.testing.assert_allclose(slope, (sides[0] - sides[1]) / 2e-4, rtol=1e-5, atol=0)
+    of_kind: dict[str, tuple] = {
+        "torque": (damping, run, lambda d: d.torque),
+        "postures": (offset, postures, lambda d: d.position),
+    }
+    fitted, data, leaf = of_kind[kind]
+    way = np.cos(np.arange(np.size(leaf(data)))).reshape(np.shape(leaf(data)))
+    sides = [fitted(eqx.tree_at(leaf, data, np.asarray(leaf(data)) + s * 1e-4 * way)) for s in (1, -1)]
+    slope = (np.asarray(leaf(jax.grad(fitted)(data))) * way).sum()
+    np.testing.assert_allclose(slope, (sides[0] - sides[1]) / 2e-4, rtol=1e-5, atol=0)
 
 
 def test_one_recording_where_a_list_is_expected_is_told(robot: fj.RobotModel):

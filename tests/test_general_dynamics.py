@@ -98,12 +98,12 @@ TREES = {
     "one of each": (2, ("planar", "spherical", "free", "revolute", "prismatic")),
     "drawn": (
         int(np.random.default_rng().integers(1 << 30)),
-        tuple(np.random.default_rng().choice(list(KINDS), size=7).tolist()),
+        tuple(np.random.default_rng().permutation(list(KINDS)).tolist()),  # one of each
     ),
 }
 
 
-@pytest.fixture(params=[pytest.param("humanoid", marks=pytest.mark.slow), "one of each", "drawn"])
+@pytest.fixture(params=[*(pytest.param(name, marks=pytest.mark.slow) for name in ("humanoid", "one of each")), "drawn"])
 def twin(request: pytest.FixtureRequest) -> Twin:
     return random_tree(*TREES[request.param])
 

@@ -147,6 +147,7 @@ def test_coupling_acts_on_both_joints_with_its_sign():
     assert np.all(added[:, 2] == 0)
 
 
+@pytest.mark.slow
 def test_delay_is_a_shift_in_time_and_lag_a_first_order_low_pass():
     for effect, key in (("torque_delay", "delay"), ("torque_lag", "time")):
         hidden, _, clean = _difference(effect)
@@ -211,7 +212,7 @@ def test_noise_has_the_stated_level_and_positions_the_stated_steps():
 
 
 def test_equal_seeds_give_equal_cases_and_unphysical_ones_are_refused():
-    one, two = (make_case(["stribeck_friction"], robot="small", trajectories=1, seed=9) for _ in range(2))
+    one, two = (make_case(["stribeck_friction"], robot="small", trajectories=1, seed=9, duration=3.0) for _ in range(2))
     assert one.truth == two.truth
     assert np.array_equal(one.recordings[1]["torque"], two.recordings[1]["torque"])
     with pytest.raises(ValueError, match="not physical"):
@@ -271,6 +272,7 @@ def test_closed_loop_effect_has_its_size_at_its_joint_alone(effect: str):
     assert np.delete(misfit, joint).max() < 0.01
 
 
+@pytest.mark.slow
 def test_every_closed_loop_effect_changes_the_recording():
     options = {"robot": "small", "trajectories": 1, "repeats": 1, "noise": 0.0, "seed": 4, "duration": 0.5}
     clean = {trusted: make_closed_loop_case([], trusted=trusted, **options) for trusted in (False, True)}

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 from robots import joint, link, robot
 
@@ -62,14 +64,9 @@ def recording(chosen: dict) -> Recording:
     return Recording("run", Path("run.npz"), ("j0", "j1"), t, q, None, tau)
 
 
-@settings(
-    max_examples=15,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
-@given(models(), CHOICES, st.booleans(), st.sampled_from(["physical", "unconstrained", "log_cholesky"]))
-def test_any_data_ends_with_numbers_or_one_message(tmp_path: Path, text: str, chosen: dict, drives: bool, fit):
-    file = tmp_path / "robot.urdf"
+def ended(folder: Path, text: str, chosen: dict, drives: bool, fit: Any) -> None:
+    """What an identification of the model from the recording ends with."""
+    file = folder / "robot.urdf"
     file.write_text(text)
     try:
         model: fj.RobotModel = load_urdf(file)
@@ -84,3 +81,20 @@ def test_any_data_ends_with_numbers_or_one_message(tmp_path: Path, text: str, ch
     assert all(b["value"] is not None and b["std"] is not None for b in answer["base_parameters"])
     assert all(entry["consistent"] for entry in answer["links"]) or fit == "unconstrained"
     assert all(np.isfinite(value) for value in found.fit.rms[np.isfinite(found.fit.rms)])
+
+
+DRAWN = given(models(), CHOICES, st.booleans(), st.sampled_from(["physical", "unconstrained", "log_cholesky"]))
+UNHURRIED = {"deadline": None, "suppress_health_check": [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]}
+
+
+@settings(max_examples=5, **UNHURRIED)
+@DRAWN
+def test_any_data_ends_with_numbers_or_one_message(tmp_path: Path, text: str, chosen: dict, drives: bool, fit: str):
+    ended(tmp_path, text, chosen, drives, fit)
+
+
+@pytest.mark.slow
+@settings(max_examples=60, **UNHURRIED)
+@DRAWN
+def test_any_of_many_data_does(tmp_path: Path, text: str, chosen: dict, drives: bool, fit: str):
+    ended(tmp_path, text, chosen, drives, fit)

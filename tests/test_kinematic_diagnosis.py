@@ -56,7 +56,7 @@ def answered(folder: Path, robot: str, effect: str | None, size: float, seed: in
     return bench.grade(case, found), found, case
 
 
-@pytest.mark.parametrize("hidden", [0.0, 0.02])
+@pytest.mark.parametrize("hidden", [0.0, pytest.param(0.02, marks=pytest.mark.slow)])
 def test_postures_without_noise_are_answered(hidden: float):
     """Points by Pinocchio, exact to rounding: a simulation's (it ended in a singular matrix)."""
     robot = pin.buildModelFromUrdf(fj.DEMO)
@@ -100,7 +100,9 @@ def test_a_hidden_effect_is_named_where_it_is_and_nothing_else(effect: str, size
     assert found.p_value < 0.05
 
 
-@pytest.mark.parametrize(("effect", "size"), [("joint_offset", 10.0), ("link_geometry", 10.0)])
+@pytest.mark.parametrize(
+    ("effect", "size"), [pytest.param("joint_offset", 10.0, marks=pytest.mark.slow), ("link_geometry", 10.0)]
+)
 def test_an_error_that_the_task_calls_good_enough_is_nothing(effect: str, size: float, folder: Path):
     bench = study()
     arm = bench.arm("arm6", folder)
@@ -116,6 +118,7 @@ def test_an_effect_drawn_now_is_named(folder: Path):
     assert grade == "right", (seed, case.right, found.causes)
 
 
+@pytest.mark.slow
 def test_the_order_of_a_gear_is_found_between_the_values_of_the_grid(folder: Path):
     grade, found, case = answered(folder, "arm6", "gear_transmission_error", 6.0, 44)
     assert grade == "right"
@@ -124,6 +127,7 @@ def test_the_order_of_a_gear_is_found_between_the_values_of_the_grid(folder: Pat
     assert abs(order.value - case.order) < 5.0 * order.std
 
 
+@pytest.mark.slow
 def test_the_order_of_a_harmonic_drive_is_found_in_the_postures(folder: Path):
     bench = study()
     arm = bench.arm("arm6", folder)
@@ -149,6 +153,7 @@ def test_frames_may_all_be_known(folder: Path):
     assert found.after[0] < 0.02 * found.before[0]
 
 
+@pytest.mark.slow
 def test_an_effect_beside_a_geometry_that_is_right_is_named(folder: Path):
     """The links stand exactly where the file says: frames alone are the level, and what is beside them stays."""
     bench, rng = study(), np.random.default_rng()
@@ -187,7 +192,7 @@ def test_errors_of_a_camera_in_the_hand_are_no_joint_that_varies(folder: Path):
     assert found.noise[0] is not None and abs(found.noise[0] - 0.2) < 0.03
 
 
-@pytest.mark.parametrize("noise", [0.0, 1e-6])
+@pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 1e-6])
 def test_an_offset_in_postures_of_a_simulation_is_named(noise: float, folder: Path):
     """What a prior leaves beside so precise a device is a small share of a column, and no rounding."""
     arm, rng = study().arm("arm6", folder), np.random.default_rng(5)
@@ -210,6 +215,7 @@ def _exact(arm: Any, q: np.ndarray) -> list[pin.SE3]:
     return found
 
 
+@pytest.mark.slow
 def test_a_robot_that_is_slack_gets_no_joint_offsets(folder: Path):
     """What is named predicts postures that were held out better than the frames alone; here offsets do not."""
     arm = study().arm("arm6", folder)
@@ -267,7 +273,14 @@ def test_a_posture_too_far_off_for_the_play_of_a_joint_is_an_outlier(folder: Pat
     assert found.verdict == "named+rest", seed
 
 
-@pytest.mark.parametrize("robot, kept", [("arm6", None), ("arm6", 3267418522), ("arm6", 1674464884), ("panda", 81)])
+@pytest.mark.parametrize(
+    "robot, kept",
+    [
+        ("arm6", None),
+        *(pytest.param("arm6", seed, marks=pytest.mark.slow) for seed in (3267418522, 1674464884)),
+        pytest.param("panda", 81, marks=pytest.mark.slow),
+    ],
+)
 def test_an_offset_of_a_robot_whose_links_are_all_off_is_not_called_a_link(
     robot: str, kept: int | None, folder: Path, data_dir: Path
 ):

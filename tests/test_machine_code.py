@@ -78,12 +78,12 @@ def test_memory_is_used_again_when_nobody_holds_the_answer(
         pytest.skip("a system without MADV_FREE")
     monkeypatch.setattr(memory, "LEAST", 1 << 10)
     memory._shelf.clear()
-    model = robots.load(robots.TREE, tmp_path)
+    model = robots.load(robots.ARM, tmp_path)
     one, two, three = ([x[k : k + 64] for x in states(model, 200)] for k in (0, 64, 128))
     run, plain = code.machine_code(FORMS["dense"], model, *one), FORMS["dense"].plain
     assert run is not None
     first = run(code.own_room, *one)
-    place, part = first.ctypes.data, first[5, 1:, 3]
+    place, part = first.ctypes.data, first[5, 1:, 13]
     expected = part.copy()
     del first
     second = run(code.own_room, *two)

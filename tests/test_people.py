@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -208,15 +209,18 @@ def test_a_person_on_a_plate_moves_as_one_whose_foot_stands_still(tmp_path: Path
         people.standing(robot, "foot", np.zeros(9))
 
 
-def test_a_motion_on_a_plate_keeps_limits_and_balance_and_tells_more(tmp_path: Path) -> None:
-    robot = stick(tmp_path)
+def on_one_foot(robot: fj.RobotModel) -> tuple[fj.RobotModel, fj.Learned, Any, Any]:
+    """A person on a plate, what a recording there would tell, limits and a basis of the motion."""
     person = people.standing(robot, "foot", upright(robot), support=(0.12, 0.1))
     sigma = dict.fromkeys(people.PLATE, 2.0)
     learned = fj.learn(person, fj.Baseline(viscous=False, coulomb=False), measured=sigma, hold=people.PLATE)
-    limits = fj.limits_of(person, velocity=2.0, acceleration=6.0)
-    basis = fj.fourier(2, 0.25, 4.0)
-    with pytest.raises(InputError, match=r"start: holding still there takes .* 'plate_T[xy]' .*`people.balanced` says"):
-        fj.excite(person, basis, limits, learned, start=np.repeat([0.0, 1.2], [6, 3]))
+    return person, learned, fj.limits_of(person, velocity=2.0, acceleration=6.0), fj.fourier(2, 0.25, 4.0)
+
+
+@pytest.mark.slow
+def test_a_motion_on_a_plate_keeps_limits_and_balance_and_tells_more(tmp_path: Path) -> None:
+    robot = stick(tmp_path)
+    person, learned, limits, basis = on_one_foot(robot)
     start = people.balanced(person, np.repeat([0.0, 0.3], [6, 3]))
     assert not start[:6].any()
     still = plate_wrench(
@@ -235,6 +239,13 @@ def test_a_motion_on_a_plate_keeps_limits_and_balance_and_tells_more(tmp_path: P
     weight = 9.81 * 20.0
     assert (np.abs(wrench[:, 3:5]) < weight * np.array([0.1, 0.12]) * 1.001).all()
     assert (found.std < 0.5 * found.std_before).mean() > 0.4
+
+
+def test_what_cannot_stand_on_a_plate_is_refused(tmp_path: Path) -> None:
+    robot = stick(tmp_path)
+    person, learned, limits, basis = on_one_foot(robot)
+    with pytest.raises(InputError, match=r"start: holding still there takes .* 'plate_T[xy]' .*`people.balanced` says"):
+        fj.excite(person, basis, limits, learned, start=np.repeat([0.0, 1.2], [6, 3]))
     with pytest.raises(InputError, match=r"balanced: near has shape \(3,\)"):
         people.balanced(person, np.zeros(3))
     with pytest.raises(InputError, match="balanced: hold: no moving joint 'kneee'; did you mean 'knee'"):

@@ -45,7 +45,7 @@ print(float(np.abs(slope.inertia).max()), slope.inertia.dtype)
     assert done.stdout.endswith("float32\n")
 
 
-@pytest.mark.parametrize("kind", ["continuous", "prismatic"])
+@pytest.mark.parametrize("kind", ["continuous", pytest.param("prismatic", marks=pytest.mark.slow)])
 def test_one_joint_has_gradients_by_everything(kind: str, tmp_path: Path, default_mode: None):
     file = tmp_path / "one.urdf"
     file.write_text(ONE.format(kind=kind))

@@ -67,7 +67,9 @@ def robot(request: pytest.FixtureRequest) -> RobotModel:
     return request.getfixturevalue(request.param)
 
 
-@pytest.mark.parametrize("name", robots.REAL)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("panda", "tiago"))) for name in robots.REAL]
+)
 def test_regressor_of_real_robots_is_pinocchios(name: str, data_dir: Path) -> None:
     path = data_dir / robots.REAL[name]
     model = load_urdf(path)

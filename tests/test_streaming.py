@@ -70,7 +70,7 @@ def test_normal_matrix_and_factor_are_those_of_the_dense_rows(samples: int, tree
     assert_relatively_equal(R.T @ R, expected)
 
 
-@pytest.mark.parametrize("name", ["tx40", pytest.param("panda", marks=pytest.mark.slow), "talos"])
+@pytest.mark.parametrize("name", ["tx40", *(pytest.param(name, marks=pytest.mark.slow) for name in ("panda", "talos"))])
 def test_normal_matrix_and_factor_of_real_robots(name: str, data_dir: Path) -> None:
     from figaroh_jax.formats.urdf import load_urdf
 
