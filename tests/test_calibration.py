@@ -25,6 +25,7 @@ from figaroh_jax.recordings.posture_checks import OFF, check_pose_recording
 from figaroh_jax.reporting.calibration_files import write_calibration
 from figaroh_jax.reporting.calibration_report import nominal_of
 from figaroh_jax.reporting.picture import segments
+from figaroh_jax.reporting.terminal import show_calibration
 from figaroh_jax.reporting.verification import DEFAULT_LIMITS
 
 OFFSET = np.array([0.01, -0.03, 0.05, 0.04, -0.06, 0.02])
@@ -136,6 +137,11 @@ def test_calibrated_robot_predicts_postures_it_has_not_seen(calibrated: Calibrat
     assert calibrated.converged
 
 
+def test_the_terminal_says_the_level(calibrated: Calibration, capsys: Any):
+    show_calibration(calibrated)
+    assert "full geometry" in capsys.readouterr().out
+
+
 def test_run_directory_holds_what_the_contract_asks(wrong: tuple[Path, poses.Truth], tmp_path: Path, capsys: Any):
     out = tmp_path / "run"
     assert cli.main(["calibrate", str(wrong[0]), "--out", str(out), "--quiet", "--json"]) == 0
@@ -166,8 +172,6 @@ def test_run_directory_holds_what_the_contract_asks(wrong: tuple[Path, poses.Tru
     assert {q["axis"] for q in result["quality"]} == {"x", "y", "z"}
     assert all(q["rmse"] < 0.2 < 1.0 < q["before"] and 0.999 < q["r2"] < 1.0 for q in result["quality"])
     assert all(abs(pair["value"]) <= 1.0 and pair["one"] != pair["other"] for pair in result["correlations"])
-    assert cli.main(["calibrate", str(wrong[0]), "--out", str(out), "--quiet"]) == 0
-    assert "full geometry" in capsys.readouterr().out
 
 
 def test_the_level_that_is_asked_for_is_the_one_that_is_fitted(

@@ -10,6 +10,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,7 @@ WRONG: dict[str, tuple[Callable[[Arrays], Arrays], list[float] | None, str]] = {
 }
 
 
+@cache
 def hidden(robot: str, seed: int = SEED) -> Case:
     """Friction that is named in the recordings as they are (`test_the_same_recordings_as_they_are_keep_their_name`)."""
     return make_case([("stribeck_friction", 0.15)], robot=robot, repeats=2, trajectories=2, seed=seed)

@@ -142,6 +142,7 @@ def address(folder: Path, number: int) -> str:
     return told.read_text()
 
 
+@pytest.mark.slow
 def test_two_processes_with_pieces_of_their_own_give_the_sums_of_one(tmp_path: Path):
     paths = os.pathsep.join([str(TESTS), str(TESTS.parent)])
     environment = os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"}
@@ -162,6 +163,7 @@ def test_two_processes_with_pieces_of_their_own_give_the_sums_of_one(tmp_path: P
     np.testing.assert_allclose(first.T @ first, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_vmap_over_robots_and_their_trajectories_is_one_fit_after_another(tmp_path: Path):
     rows = tree_states(tmp_path)
     base, count = rows.structural, 3

@@ -196,7 +196,7 @@ def test_what_cannot_be_chosen_is_one_message(tmp_path: Path, block: str, messag
         excite_task(load_task(tmp_path / "task.yaml"))
 
 
-@pytest.mark.parametrize("kind", ["plane", "socket"])
+@pytest.mark.parametrize("kind", [pytest.param("plane", marks=pytest.mark.slow), "socket"])
 def test_designed_postures_touch_what_they_are_measured_with(tmp_path: Path, kind: Literal["plane", "socket"]):
     """Points by Pinocchio's poses; the information is that of differences of what a touch measures."""
     arm, point = robots.load(LONG, tmp_path), np.array([0.02, 0.0, 0.1])

@@ -80,6 +80,7 @@ def test_panda_predicts_the_last_part_of_its_recording(data_dir: Path, tmp_path:
     assert physical(found) and pooled(found.fit) <= 1.12 * pooled(found.unconstrained)
 
 
+@pytest.mark.slow
 def test_ur10e_predicts_other_runs(data_dir: Path, tmp_path: Path):
     found = identify_task(fj.load_task(real_tasks.ur10e_task(tmp_path, data_dir)))
     r2 = np.mean([quality.r2 for quality in found.holdout.values()], axis=0)

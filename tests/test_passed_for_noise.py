@@ -58,12 +58,13 @@ def test_the_noise_beside_a_large_ripple_is_that_of_its_sensor(seed: int):
         assert abs(told[name].value - value) < 4.5 * told[name].std, (seed, name)
 
 
+@pytest.mark.slow
 @needs_robots
 @pytest.mark.parametrize(
     "effect, at",
     [
         ("asymmetric_viscous_friction", ("joint_2",)),
-        pytest.param("friction_drift", ("joint_6",), marks=pytest.mark.slow),
+        ("friction_drift", ("joint_6",)),
     ],
 )
 def test_what_the_catalogue_lacks_is_not_told_as_noise(effect: str, at: tuple[str, ...]):

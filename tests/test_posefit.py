@@ -160,6 +160,7 @@ def test_rows_in_c_are_those_in_numpy(name: str, estimated: tuple[str, ...], tmp
                 np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_many_postures_are_solved_by_rows_in_c_as_by_the_compiled_ones(model: RobotModel, monkeypatch):
     rng, many = np.random.default_rng(11), 300
     device, _ = devices(rng)["poses"]

@@ -139,5 +139,6 @@ def test_plain_grad_of_every_public_function_in_a_fresh_interpreter(mode: str, n
     _gradients(mode, name)
 
 
+@pytest.mark.slow
 def test_plain_grad_of_the_mass_matrix_in_a_fresh_interpreter():
     _gradients("x64", "mass_matrix")

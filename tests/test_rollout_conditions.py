@@ -41,7 +41,9 @@ DRIVES = ("position", "position", "limited", "geared", "general", "stated")
         pytest.param(
             41206, 4, [], DRIVES, "right", id="a tilt that shows along the joint's axis too", marks=pytest.mark.slow
         ),
-        pytest.param(31007, 2, ["payload"], PLAIN, "right", id="a load at the tip, with its own inertia"),
+        pytest.param(
+            31007, 2, ["payload"], PLAIN, "right", id="a load at the tip, with its own inertia", marks=pytest.mark.slow
+        ),
         pytest.param(
             31019, 2, ["payload"], PLAIN, "right", id="a load that three causes imitate", marks=pytest.mark.slow
         ),

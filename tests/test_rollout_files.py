@@ -350,7 +350,7 @@ def test_torques_in_the_order_of_the_motors_are_refused(tmp_path: Path, capsys):
     text += '<actuator><motor joint="lift" gear="-5"/><motor joint="yaw" gear="8"/></actuator></mujoco>'
     (tmp_path / "arm.xml").write_text(text)
     model = mujoco.MjModel.from_xml_string(text)
-    data, t, u, q = mujoco.MjData(model), 0.01 * np.arange(400), [], []
+    data, t, u, q = mujoco.MjData(model), 0.01 * np.arange(250), [], []
     for now in t:
         q.append(data.qpos.copy())
         wanted = [0.8 * np.sin(3.1 * now), 0.6 * np.sin(2.3 * now) + 0.2 * np.sin(6.1 * now)]

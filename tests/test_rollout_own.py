@@ -240,14 +240,19 @@ def test_what_a_step_does_not_know_is_refused(tmp_path: Path):
             loop.with_effects(fj.place(fj.CATALOGUE[name], loop.robot, ["lift"]))
 
 
-def test_a_baseline_names_what_a_rollout_can_fit(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """An effect of the catalogue acts by its torque where the loop has no number for it; what has none is refused."""
+def test_what_a_rollout_has_no_number_for_is_refused_in_a_baseline(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "servo.xml").write_text(SERVO)
-    u = command(600)
-    q = simulated_by_mujoco(u, 0.0, 0.0)
+    q = simulated_by_mujoco(command(600), 0.0, 0.0)
     task = recorded(tmp_path, q, "{effect: joint_elasticity, at: [lift]}")
     assert main(["identify", str(task), "--out", str(tmp_path / "out"), "--quiet"]) == 2
     assert "a rollout has no number for 'joint_elasticity' at 'lift'" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_baseline_names_what_a_rollout_can_fit(tmp_path: Path):
+    """An effect of the catalogue acts by its torque where the loop has no number for it."""
+    (tmp_path / "servo.xml").write_text(SERVO)
+    q = simulated_by_mujoco(command(1500), 0.0, 0.0)
     told = identified(tmp_path, q, "{effect: asymmetric_coulomb_friction, at: [lift]}")
     assert "asymmetric_coulomb_friction.difference lift" in told
 

@@ -78,6 +78,7 @@ def test_what_is_hidden_beside_positions_that_shake_is_named():
     assert abs(told - size) < 0.1 * size, seed
 
 
+@pytest.mark.slow
 @needs_robots
 def test_positions_that_shake_cost_an_identification_little():
     case, bad, seed = drawn()
