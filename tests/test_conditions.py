@@ -37,7 +37,9 @@ from figaroh_jax.reporting.wording import sentence
         pytest.param(
             971270108, False, marks=pytest.mark.slow
         ),  # unknown: slow noise, most of whose power is a hundredth of the band
-        (4128371, False),  # unknown: two repeats of 4 s, whose common power was told twice
+        pytest.param(
+            4128371, False, marks=pytest.mark.slow
+        ),  # unknown: two repeats of 4 s, whose common power was told twice
         pytest.param(
             4129578, True, marks=pytest.mark.slow
         ),  # unknown: repeats with a torque of ten bits, whose steps repeat
@@ -70,6 +72,7 @@ def test_what_few_rows_cannot_tell_from_slow_noise_is_not_called_agreement(tmp_p
     assert found.experiment is not None and "s of such motion in all" in found.experiment.text
 
 
+@pytest.mark.slow
 def test_as_few_rows_of_a_right_model_agree_with_it(tmp_path: Path) -> None:
     make(tmp_path, 6633519, "clean")  # 8 s
     found = fj.diagnose_task(fj.load_task(str(tmp_path / "task.yaml")))

@@ -219,6 +219,7 @@ for name in ("short", "long"):
 """
 
 
+@pytest.mark.slow
 def test_memory_is_the_same_for_twenty_times_the_samples_from_disk(tmp_path: Path):
     """Peak resident memory in MB: the long files hold 26 MB, their columns 130."""
     model, random = load(ARM, tmp_path), np.random.default_rng(0)

@@ -233,7 +233,8 @@ def test_numbers_by_name_are_those_of_one_fit(rubbing: fj.ExtendedModel):
         jax.jit(lambda run: fj.fit(rubbing, run, "friction").parameters)(moved_arm(rubbing, 0.1))
 
 
-@pytest.mark.parametrize("kind", [pytest.param("torque", marks=pytest.mark.slow), "postures"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["torque", "postures"])
 def test_plain_gradients_by_all_of_the_data_are_those_of_refits(
     kind: str, robot: fj.RobotModel, tracked: tuple[fj.PoseData, ...], rubbing: fj.ExtendedModel
 ):

@@ -90,9 +90,10 @@ def test_an_effect_whose_size_may_be_zero_is_no_cause(folder: Path, monkeypatch:
     assert told[effect, at].why_not == "its size may be zero" and told[effect, at].share > 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "size", "seed"),
-    [("link_compliance", 6.0, 42), pytest.param("tool_frame", 4.0, 43, marks=pytest.mark.slow)],
+    [("link_compliance", 6.0, 42), ("tool_frame", 4.0, 43)],
 )
 def test_a_hidden_effect_is_named_where_it_is_and_nothing_else(effect: str, size: float, seed: int, folder: Path):
     grade, found, case = answered(folder, "arm6", effect, size, seed)

@@ -61,6 +61,7 @@ def test_a_hand_of_the_file_that_is_not_mounted_is_told_with_its_mass(tmp_path: 
     assert (kept["moved"][0]["effect"], kept["moved"][0]["at"]) == ("link_inertia", ["rod"])
 
 
+@pytest.mark.slow
 def test_the_link_whose_mass_lies_elsewhere_is_told_with_its_moments(tmp_path: Path) -> None:
     seed = secrets.randbits(31)
     wrong = wrong_links.moved(tmp_path, seed)

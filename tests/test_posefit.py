@@ -114,7 +114,13 @@ def problem(model: RobotModel, device: Device, datum: np.ndarray, q: np.ndarray,
     return posefit.Problem((group,), posefit.sizes([group], [1e-2] * 7), 7)
 
 
-@pytest.mark.parametrize("name", devices(np.random.default_rng(0)))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("poses on the body", "camera of the world")))
+        for name in devices(np.random.default_rng(0))
+    ],
+)
 def test_jacobian_of_every_device_is_the_derivative_of_its_rows(name: str, model: RobotModel):
     rng = np.random.default_rng(5)
     device, datum = devices(rng)[name]

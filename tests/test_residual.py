@@ -104,15 +104,24 @@ def devices(robot: fj.RobotModel) -> dict[str, fj.PoseData]:
     return {kind: fj.pose_data(robot, one)[0] for kind, one in recordings.items()}
 
 
-def test_every_device_has_a_residual_that_differentiates(robot: fj.RobotModel):
-    data = tuple(devices(robot).values())
-    assert isinstance(data[2].device, Planes) and isinstance(data[3].device, Sockets)
+COUNTS = {"pose": 12 * 6, "position": 12 * 3, "plane": 12, "socket": 12 * 3 + 1, "camera": 12 * 6, "device": 12}
+
+
+@pytest.mark.parametrize(
+    "kinds", [("position", "socket", "device"), pytest.param(tuple(COUNTS), marks=pytest.mark.slow)], ids=len
+)
+def test_every_device_has_a_residual_that_differentiates(robot: fj.RobotModel, kinds: tuple[str, ...]):
+    """Half of the devices, and all of them together; `test_posefit.py` has the derivatives of each."""
+    every = devices(robot)
+    assert isinstance(every["plane"].device, Planes) and isinstance(every["socket"].device, Sockets)
+    data = tuple(every[kind] for kind in kinds)
     model = fj.extend(robot)
     rows = fj.residual(model, data)
-    counts = [12 * 6, 12 * 3, 12, 12 * 3 + 1, 12 * 6, 12]
-    assert len(rows) == sum(counts)
-    for part in (rows[: 12 * 6], rows[12 * 6 : 12 * 9]):  # frames in closed form are exact
-        np.testing.assert_allclose(part, 0.0, rtol=0, atol=1e-9)
+    ends = np.cumsum([COUNTS[kind] for kind in kinds])
+    assert len(rows) == ends[-1]
+    for kind, part in zip(kinds, np.split(np.asarray(rows), ends[:-1]), strict=True):
+        if kind in ("pose", "position"):  # frames in closed form are exact
+            np.testing.assert_allclose(part, 0.0, rtol=0, atol=1e-9)
 
     def moved(placement: jax.Array) -> jax.Array:
         return fj.residual(eqx.tree_at(lambda m: m.robot.placement, model, placement), data)

@@ -167,7 +167,7 @@ def test_a_registered_effect_is_identified_and_exported(
     known: type[fj.Effect], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     """Its numbers by the command line; the files move MuJoCo as it moved, once its torque is said there too."""
-    u = command(2000)
+    u = command(1000)
     q = simulated_by_mujoco(u, 0.0, 0.0)
     (tmp_path / "servo.xml").write_text(SERVO.replace('frictionloss="0.15"', 'frictionloss="0.3"'))
     told = identified(tmp_path, q, "{effect: test_notch, at: [lift]}")

@@ -96,7 +96,7 @@ def test_a_recording_of_commands_moves_the_arm_as_mujoco_moves_it(tmp_path: Path
     np.testing.assert_allclose(table.vector("q.j2", "q"), found["position"][:, 1], rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("interpolate", [False, True])
+@pytest.mark.parametrize("interpolate", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_set_points_at_uneven_times_are_held_or_joined_by_lines(interpolate: bool, tmp_path: Path):
     written(tmp_path)
     t, u = np.array([0.0, 0.5, 0.6, 1.7]), np.array([[0.0, 0.1], [0.5, -0.2], [0.1, 0.4], [-0.3, 0.0]])

@@ -32,7 +32,12 @@ from figaroh_jax.recordings.signals import prepare_all
     [
         pytest.param(2, "nothing", id="two joints that move one after another, stamps that shake"),
         pytest.param(21, "nothing", id="joints that rest, one of them gated", marks=pytest.mark.slow),
-        pytest.param(38, "nothing", id="a joint about the vertical that rests: its torque is all friction"),
+        pytest.param(
+            38,
+            "nothing",
+            id="a joint about the vertical that rests: its torque is all friction",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(94, "nothing", id="moves with rests, without a filter", marks=pytest.mark.slow),
         pytest.param(104, "nothing", id="stamps that shake, a recording kept out", marks=pytest.mark.slow),
         pytest.param(
