@@ -139,6 +139,15 @@ def check_positive(name: str, given: Any, unit: str, below: float = math.inf) ->
         )
 
 
+def check_switch(name: str, given: Any) -> None:
+    """Refuse all but True and False; of a text such as "no" Python would make True."""
+    import numpy as np
+
+    if not isinstance(given, bool | np.bool_):
+        told = f"the text '{given[:100]}'" if isinstance(given, str) else f"{given!r:.100}"
+        raise InputError(f"{name} is {told}; True or False is expected")
+
+
 def check_names(name: str, given: Any) -> None:
     """Refuse what is no list of names where one is expected; of one text the letters would be taken for names."""
     if not (given is None or isinstance(given, Iterable)):

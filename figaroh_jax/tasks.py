@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, overload
 
-from .errors import InputError, check_each, check_positive
+from .errors import InputError, check_each, check_positive, nearest
 from .formats.config import Preprocess, Task
 from .formats.taskfile import check_effects
 from .recordings.checks import Checked, checked_recordings
@@ -127,6 +128,10 @@ def diagnose(
         return replace(found, calibration=replace(found.calibration, notes=(*warnings, *found.calibration.notes)))
     from .diagnosis.diagnosis import diagnose as of_torques
 
+    known_options = inspect.signature(of_torques).parameters
+    for option in options:
+        if option not in known_options:
+            raise InputError(f"diagnose has no argument '{option}'{nearest(option, known_options)}")
     torques: Any = recordings
     warnings, contradictions = _checked(model, torques)
     options = {"contradictions": contradictions} | options

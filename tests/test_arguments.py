@@ -45,6 +45,11 @@ def device(**wrong: Any) -> Any:
     return fj.Instrument("pose", "base", "hand", **wrong)
 
 
+def turned(**more: Any) -> Any:
+    """A recording whose columns are in another order than the robot's."""
+    return fj.recording(q=Q, tau=Q, rate=100, joints=["elbow", "waist", "wrist", "shoulder"], **more)
+
+
 SEEN = seen()
 WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "gravity": (lambda: fj.inverse_dynamics(robot_with("gravity", np.zeros(2)), Q, Q, Q), r"model.gravity .*\(2,\)"),
@@ -102,6 +107,32 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "load": (
         lambda: ANY.recording(q=Q, tau=Q, rate=100, load=2.0),
         r"load is of type float; a Load .* fj.Load\(frame=",
+    ),
+    "switch": (lambda: ANY.calibrate(ROBOT, [SEEN], priors="no"), "priors is the text 'no'; True or False is expected"),
+    "check": (lambda: ANY.identify(ROBOT, [RUN], check="no"), "check is the text 'no'; True or False"),
+    "kinematic": (lambda: ANY.load_urdf(fj.DEMO, kinematic=1), "kinematic is 1; True or False"),
+    "polish": (lambda: ANY.excite_postures(ROBOT, device(), polish=None), "polish is None; True or False"),
+    "choice": (lambda: ANY.shape("rad", (1.0,), choice="no"), "choice is the text 'no'; True or False"),
+    "floating": (lambda: ANY.read_recordings(None, ROBOT, floating="no"), "floating is the text 'no'; True or False"),
+    "switch of a baseline": (lambda: ANY.Baseline(coulomb="no"), "coulomb: expected true or false, not 'no'"),
+    "text of an option": (lambda: ANY.Preprocess(cutoff="15"), "cutoff: expected a number, not the text '15'"),
+    "texts of an option": (lambda: ANY.Preprocess(window=("0", 1)), r"window\[0\]: expected a number, not the text"),
+    "packages": (lambda: fj.load_urdf(fj.DEMO, packages="src"), r"packages is the text 'src'; .*\['src'\]"),
+    "option": (lambda: fj.diagnose(ROBOT, [RUN], tolerence=0.1), "diagnose has no argument 'tolerence'; .*'tolerance'"),
+    "joint": (
+        lambda: fj.recording(q=Q, tau=Q, rate=100, joints=["waist", "shoulder", "elbo", "wrist"], model=ROBOT),
+        "'demo_arm' has no joint 'elbo'; did you mean 'elbow'",
+    ),
+    "joint twice": (lambda: fj.recording(q=Q, tau=Q, rate=100, joints=list("aabc")), "joints names 'a' twice"),
+    "number of a joint": (
+        lambda: ANY.recording(q=Q, tau=Q, rate=100, joints=[1, 2, 3, 4]),
+        "joints is of type int; a str",
+    ),
+    "order": (lambda: fj.torque_data(ROBOT, turned()), r"'elbow', which is column 2 .* \[:, \[1, 3, 0, 2\]\]"),
+    "order diagnosed": (lambda: fj.diagnose(ROBOT, [turned()]), "into its order, waist, shoulder, elbow, wrist"),
+    "order of a model": (
+        lambda: turned(model=ROBOT),
+        "column 0 .from 0. 'elbow', which is column 2 of robot 'demo_arm'",
     ),
     "names": (lambda: fj.recording(q=Q, tau=Q, rate=100, joints="elbow"), "joints is the text 'elbow'; a list"),
     "extended": (lambda: ANY.recording(q=Q, tau=Q, rate=100, model=MODEL), "ExtendedModel; a RobotModel .* `.robot`"),

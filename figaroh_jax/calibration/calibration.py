@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..effects.kinematic import HISTORY
-from ..errors import InputError, check_each, check_kind, nearest
+from ..errors import InputError, check_each, check_kind, check_switch, nearest
 from ..estimation import marginal
 from ..estimation.gravity import without_far_masses
 from ..estimation.posegroups import Measured, assemble, postures_of
@@ -116,6 +116,7 @@ def _calibrated(
     """`calibrate` of recordings that were checked."""
     if level is not None and level not in levels.LEVELS:
         raise InputError(f"no level '{level}' of calibration{nearest(level, levels.LEVELS)}")
+    check_switch("priors", priors)
     with jax.enable_x64(True):
         return Run(model, recordings, forbid, progress, level, priors).finish()
 

@@ -32,7 +32,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from ..errors import InputError, check_finite, check_real
+from ..errors import InputError, check_finite, check_real, check_switch
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.model import Leaf, RobotModel
 from .loops import InRollouts
@@ -227,6 +227,7 @@ def shape(
     if isinstance(grid, str) or not isinstance(grid, Sequence) or not len(grid):
         raise InputError(f"grid is {grid!r:.100}; the values from which the search starts are expected, (0.1, 0.2) say")
     check_finite("grid", grid)
+    check_switch("choice", choice)
     _check_bounds("bounds", bounds)
     lower, upper = bounds or (min(grid), max(grid))
     parameter = Parameter(unit, False, lower, upper, tuple(grid), choice, hole)

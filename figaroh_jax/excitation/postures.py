@@ -21,7 +21,16 @@ from jaxtyping import Float, Int
 from ..calibration.candidates import geometry_columns
 from ..calibration.gauge import find_gauge
 from ..effects.kinematic import Column
-from ..errors import InputError, check_count, check_each, check_finite, check_kind, check_one_of, check_real
+from ..errors import (
+    InputError,
+    check_count,
+    check_each,
+    check_finite,
+    check_kind,
+    check_one_of,
+    check_real,
+    check_switch,
+)
 from ..estimation import posefit
 from ..estimation.posegroups import Measured, assemble, postures_of
 from ..recordings.arrays import check_accuracy, postures as recorded
@@ -326,6 +335,7 @@ def excite_postures(
     _check_instrument(instrument)
     for name, given, least in (("count", count, 1), ("candidates", candidates, 1), ("seed", seed, 0)):
         check_count(name, given, least)
+    check_switch("polish", polish)
     check_one_of("level", level, get_args(Level))
     if clearance is not None:
         check_kind("clearance", clearance, Clearance, "`clearance_of` makes one")

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError,
 
 from ..errors import InputError, nearest
 from .excite_keys import Excite, MotionBasis, MotionLimits, SizedEffect
-from .fields import Effect, Keys, Number, Positive, Vector, mistake
+from .fields import OF_A_FILE, Effect, Keys, Number, Positive, Switch, Vector, mistake
 from .files import USD
 from .recording_keys import Load, Measurement, Preprocess, RecordingEntry, Transmission, Units
 from .taskfile import given_task, merge, read_task, where
@@ -87,10 +87,10 @@ class Baseline(Keys):
     ('elbow',)
     """
 
-    viscous: bool = True
-    coulomb: bool = True
-    rotor: bool = False
-    offset: bool = False
+    viscous: Switch = True
+    coulomb: Switch = True
+    rotor: Switch = False
+    offset: Switch = False
     effects: tuple[BaselineEffect, ...] = ()
 
     SWITCHES: ClassVar[dict[str, str]] = {
@@ -272,7 +272,7 @@ class Limits(Keys):
     rank: Annotated[int, Field(ge=0)] | None = None  # at least
     condition: Positive | None = None  # at most
     relative_std: Positive | None = None  # of identified base parameters, at most
-    consistent: bool | None = None  # every link physically consistent
+    consistent: Switch | None = None  # every link physically consistent
     position_mm: Positive | None = None  # validated, at most
     orientation_deg: Positive | None = None
     fk_parity: Positive | None = None  # m, at most
@@ -283,7 +283,7 @@ def load_limits(path: str | Path) -> Limits:
     """Read a file of limits; raises `InputError` that names file and key of the first mistake."""
     chain = read_task(Path(path))
     try:
-        return Limits.model_validate(merge(chain))
+        return Limits.model_validate(merge(chain), context=OF_A_FILE)
     except ValidationError as error:
         place, text = mistake(error.errors(include_url=False))
         raise InputError(f"{where(chain, place)}: {text}") from None
@@ -306,7 +306,7 @@ def load_task(path: str | Path | Mapping[str, Any]) -> Task:
         raise InputError(f"load_task takes the name of a task file or its keys as a dictionary, not {kind}")
     chain = given_task(path) if isinstance(path, Mapping) else read_task(Path(path))
     try:
-        task = Task.model_validate(merge(chain))
+        task = Task.model_validate(merge(chain), context=OF_A_FILE)
     except ValidationError as error:
         place, text = mistake(error.errors(include_url=False))
         raise InputError(f"{where(chain, place)}: {text}") from None

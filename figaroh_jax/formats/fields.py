@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from ..errors import InputError, nearest
 from .taskfile import check_effect
 
 __all__ = [
+    "OF_A_FILE",
     "Columns",
     "DrivenColumns",
     "Effect",
@@ -20,15 +22,27 @@ __all__ = [
     "MatrixOrDiagonal",
     "Number",
     "Positive",
+    "Switch",
     "Vector",
     "mistake",
 ]
 
 
-def _not_bool(value: Any) -> Any:
+OF_A_FILE = {"of_a_file": True}  # context of keys read from a file: YAML takes 1e-4 for a text
+
+
+def _number(value: Any, info: Any) -> Any:
     if isinstance(value, bool):
         raise ValueError("expected a number")
+    if isinstance(value, str | bytes) and info.context is not OF_A_FILE:
+        raise ValueError(f"expected a number, not the text {value!r:.100}")
     return value
+
+
+def _switch(value: Any) -> Any:
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"expected true or false, not {value!r:.100}")
+    return bool(value)
 
 
 def _columns(value: Any) -> Any:
@@ -62,8 +76,9 @@ def _label(value: Any) -> Any:
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
-Number = Annotated[float, BeforeValidator(_not_bool)]
+Number = Annotated[float, BeforeValidator(_number)]
 Positive = Annotated[Number, Field(gt=0)]
+Switch = Annotated[bool, BeforeValidator(_switch)]
 Columns = Annotated[str | tuple[str, ...], BeforeValidator(_columns)]
 DrivenColumns = Annotated[str | tuple[str | Literal[0], ...], BeforeValidator(_driven_columns)]
 Effect = Annotated[str, BeforeValidator(lambda name: _effect(str(name)))]

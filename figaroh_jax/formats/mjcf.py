@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import InputError, check_names
+from ..errors import InputError, check_names, check_switch
 from ..rigid import inertia
 from ..rigid.model import Kind, RobotModel
 from .assembly import (
@@ -95,6 +95,7 @@ def load_mjcf(
     ...     fj.load_mjcf(f"{folder}/robot.xml").joint_names
     ('waist', 'shoulder', 'elbow', 'wrist')
     """
+    check_switch("kinematic", kinematic)
     path = find_in_packages(path, packages)
     mj = compile_mjcf(path, kinematic=kinematic)
     return compiled_robot(str(path), mj, joints, posture, gravity, root, kinematic=kinematic)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import InputError, check_names, nearest
+from ..errors import InputError, check_names, check_switch, nearest
 from ..rigid import inertia
 from ..rigid.model import Kind, RobotModel
 from .assembly import JointPart, LinkPart, Posture, Root, assemble, refuse_many, wrong_moments
@@ -88,6 +88,7 @@ def load_urdf(
     ('waist', 'shoulder', 'elbow', 'wrist')
     """
     check_names("joints", joints)
+    check_switch("kinematic", kinematic)
     path = find_in_packages(path, packages)
     name, parts = urdf_parts(path)
     return assemble(str(path), name, parts, joints, posture, gravity, root, kinematic=kinematic)

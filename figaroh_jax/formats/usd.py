@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import InputError, check_names
+from ..errors import InputError, check_names, check_switch
 from ..rigid import inertia
 from ..rigid.model import RobotModel
 from .assembly import (
@@ -83,6 +83,7 @@ def load_usd(
     ('hinge',)
     """
     check_names("joints", joints)
+    check_switch("kinematic", kinematic)
     file = find_in_packages(path, packages)
     with reading(file):
         stage = Stage(file)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import InputError, check_path
+from ..errors import InputError, check_names, check_path
 from .files import read_file
 
 __all__ = ["as_text", "find_in_packages", "read_xml"]
@@ -55,6 +55,7 @@ def find_in_packages(path: str | Path, packages: Sequence[str | Path]) -> Path:
     A folder of `packages` is the package (its own name is `name`) or holds it. Raises `InputError` where none does.
     """
     check_path("path", path)
+    check_names("packages", packages)
     text = str(path)
     if not text.startswith(_PACKAGE):
         return Path(path)

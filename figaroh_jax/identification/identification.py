@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from ..effects.base import Effect
 from ..effects.friction import CoulombFriction
 from ..effects.plausibility import implausible
-from ..errors import InputError, check_each, check_names, check_one_of, check_positive, nearest
+from ..errors import InputError, check_each, check_names, check_one_of, check_positive, check_switch, nearest
 from ..estimation.base_parameters import BaseParameters, base_parameters, essential
 from ..estimation.columns import friction_terms, structural_columns
 from ..estimation.conic import Body, NotConverged
@@ -182,6 +182,7 @@ def identify(
     check_each("preprocess", [preprocess or Preprocess()], Preprocess, "Preprocess(cutoff=15), in Hz, say")
     check_one_of("fit", fit, get_args(Fit))
     check_positive("trust", trust, "relative one sigma")
+    check_switch("check", check)
     if not len(recordings):
         raise InputError("recordings is empty: there is nothing to fit")
     backend = as_backend(model)

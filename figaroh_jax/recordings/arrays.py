@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ..errors import InputError, check_kind, check_names, check_one_of, check_positive, check_real, nearest
 from ..rigid.model import RobotModel
 from . import poses
-from .dataset import Memory, Recording, unit_factors
+from .dataset import Memory, Recording, check_order, unit_factors
 from .devices import Device
 
 if TYPE_CHECKING:
@@ -46,10 +46,10 @@ def recording(
     `q` position (rad; m for sliding joints), `tau` torque of the drives on the joint side (N m; N), `time` (s) or
     `rate` (Hz), `command` commanded position. `units` may say `{"position": "deg" | "mm", "velocity": "deg/s",
     "time": "ms" | "us" | "ns"}`; with degrees or millimetres at a robot that slides somewhere, and where `q` holds
-    quaternions, give its `model`. A measured velocity `v` is kept for rollouts; identification and diagnosis
-    differentiate the position, because controllers filter their velocity with a delay that nobody states. `repeat`:
-    recordings with one label repeat one excitation; `role` "holdout" is not fitted. Raises `InputError` that names
-    array, row and column.
+    quaternions, give its `model`. Columns stand in the model's order; `joints` names them. A measured velocity `v` is
+    kept for rollouts; identification and diagnosis differentiate the position, because controllers filter their
+    velocity with a delay that nobody states. `repeat`: recordings with one label repeat one excitation; `role`
+    "holdout" is not fitted. Raises `InputError` that names array, row and column.
 
     >>> import numpy as np, figaroh_jax as fj
     >>> t = np.arange(500) / 250.0
@@ -63,6 +63,9 @@ def recording(
     if model is not None:
         check_kind("model", model, RobotModel, "load_urdf reads one; an ExtendedModel holds one as `.robot`")
     names = tuple(joints or (model.dof_names if model is not None else ()))
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"{source}: joints names '{twice}' twice; one name for each column of tau is expected")
     given = {"v": v, "tau": tau, "command": command}
     arrays = {"q": _matrix(q, "q", source)}
     arrays |= {key: _matrix(x, key, source) for key, x in given.items() if x is not None}
@@ -72,6 +75,8 @@ def recording(
         raise InputError(f"{source}: {wrong} has {len(arrays[wrong])} samples, but q has {samples}")
     columns = next((arrays[key].shape[1] for key in ("tau", "v") if key in arrays), arrays["q"].shape[1])
     names = names or tuple(f"joint {k + 1}" for k in range(columns))
+    if joints and model is not None:
+        check_order(source, names, model)
     _check_columns(arrays, names, model, source)
     known = dict(units or {})
     seconds = _unit(known.pop("time", "s"), SECONDS, "time", source)
@@ -164,6 +169,8 @@ def postures(
 def _check_words(names: Any, units: Any, known: Sequence[str], role: Any, load: Any, called: str = "joints") -> None:
     """Raise `InputError` for what is no list of names, units that are not known, another role, or no load."""
     check_names(called, names)
+    for one in names or ():
+        check_kind(called, one, str, f"{called} is a list of names")
     if units is not None:
         check_kind("units", units, Mapping, '{"position": "deg"}, say')
         for key, unit in units.items():

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from ..errors import InputError
 from ..rigid.model import RobotModel, prismatic
-from .dataset import Memory, Recording, carrying
+from .dataset import Memory, Recording, carrying, check_order
 from .findings import LIKE, SOFT, UNLIKE, Finding, Look, and_more, effort_unit, named, unit_of
 from .likeness import sampled
 from .torque_checks import torque_findings
@@ -153,13 +153,16 @@ def check_rollouts(task: Task, model: RobotModel, recordings: Sequence[Recording
 
 
 def check_columns(recording: Recording, model: RobotModel) -> None:
-    """Refuse positions of another number of joints than the robot's."""
+    """Refuse positions of another number of joints than the robot's, and columns named in another order."""
     if recording.position.shape[1] != model.nq:
         raise InputError(
             f"recording '{recording.name}': q has {recording.position.shape[1]} columns, but robot '{model.name}' has"
             f" {model.nq} numbers of position ({', '.join(model.joint_names)}); joints that stand still are left out by"
             " load_urdf(..., joints=[...])"
         )
+    unnamed = tuple(f"joint {k + 1}" for k in range(len(recording.joints)))  # as `recording` calls them
+    if isinstance(recording.file, Memory) and recording.joints != unnamed:
+        check_order(recording.file, recording.joints, model, all_known=False)
 
 
 def position_findings(

@@ -16,7 +16,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..errors import InputError, check_kind, nearest
+from ..errors import InputError, check_kind, check_switch, nearest
 from ..formats.assembly import ROOT_JOINT
 from ..rigid.inertia import from_com, transform
 from ..rigid.model import RobotModel
@@ -36,6 +36,7 @@ __all__ = [
     "Recording",
     "carried_body",
     "carrying",
+    "check_order",
     "joint_columns",
     "read_recordings",
     "read_time",
@@ -116,6 +117,8 @@ def read_recordings(
     ('first_1', 4)
     """
     check_kind("model", model, RobotModel, "read_recordings(task, load_robot(task))")
+    check_switch("floating", floating)
+    check_switch("rollouts", rollouts)
     if not hasattr(task, "preprocess"):
         raise InputError(f"task is of type {type(task).__name__}; `load_task` reads one: read_recordings(task, model)")
     _check_names(task, model, floating, "commands" if rollouts else "joint torques")
@@ -162,6 +165,22 @@ def _check_names(task: Task, model: RobotModel, floating: bool, what: str) -> No
         if entry.load is not None and entry.load.frame not in {*frames, *model.link_names}:
             place = f"{task.file}: data[{k}].load.frame"
             raise InputError(f"{place}: robot has no frame '{entry.load.frame}'{nearest(entry.load.frame, frames)}")
+
+
+def check_order(source: Memory | Path, names: Sequence[str], model: RobotModel, *, all_known: bool = True) -> None:
+    """Refuse names of columns that are those of other joints of the robot; with `all_known` also those it has not."""
+    known = model.dof_names
+    for column, name in enumerate(names):
+        if name in known and known[column : column + 1] != (name,):
+            turned = ""
+            if model.nq == model.nv and set(names) == set(known):
+                turned = f"; of q and tau, [:, {[names.index(one) for one in known]}]"
+            raise InputError(
+                f"{source}: joints names column {column} (from 0) '{name}', which is column {known.index(name)} of"
+                f" robot '{model.name}': bring the columns into its order, {', '.join(known)}{turned}"
+            )
+        if all_known and name not in known:
+            raise InputError(f"{source}: joints: robot '{model.name}' has no joint '{name}'{nearest(name, known)}")
 
 
 def carried_body(model: RobotModel, load: Load) -> tuple[int, Float[np.ndarray, "10"]]:

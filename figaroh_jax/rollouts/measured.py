@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from ..effects.base import Effect
 from ..effects.extended import ExtendedModel, changed_robot
 from ..errors import InputError, check_each, check_finite, check_kind, nearest
-from ..recordings.checks import position_findings, report_findings
+from ..recordings.checks import check_columns, position_findings, report_findings
 from ..recordings.dataset import Recording
 from ..rigid.model import Leaf, RobotModel
 from .alone import alone, carried_by, separable
@@ -187,6 +187,7 @@ def _run(loop: Loop, one: Recording) -> Run:
             f"{one.file}: q has {one.position.shape[1]} columns, but the loop measures {len(loop.measured)} joints"
         )
     if len(loop.measured) == loop.robot.nv == loop.robot.nq:
+        check_columns(one, loop.robot)
         report_findings([(one.file.name, f) for f in position_findings(one.position, loop.robot, "rad", one.time)])
     return Run(one.name, one.time, one.command[:, columns], one.position, None)
 
