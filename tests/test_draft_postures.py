@@ -16,6 +16,7 @@ import figaroh_jax as fj
 from figaroh_jax.errors import InputError
 from figaroh_jax.formats.config import load_task
 from figaroh_jax.formats.robotfile import load_robot
+from figaroh_jax.recordings.column_names import holds
 from figaroh_jax.recordings.draft import draft_task
 from figaroh_jax.recordings.poses import PoseRecording, read_pose_recordings
 
@@ -117,6 +118,23 @@ def test_angles_in_columns_are_read_in_degrees_by_the_makers_letters(measured, t
     assert one.kind == "pose"
     np.testing.assert_allclose(one.position, q, rtol=0, atol=1e-9)
     np.testing.assert_allclose(one.values, poses, rtol=0, atol=1e-6)
+
+
+def test_columns_name_joints_without_the_word_joint(measured, tmp_path: Path):
+    """`shoulder_pan [deg]` is of `shoulder_pan_joint`, in any order; a column that two joints may have is none's."""
+    urdf, q, _, points = measured
+    names = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+    text = urdf.read_text()
+    for old, new in zip(ARM, names, strict=True):
+        text = text.replace(f'"{old}"', f'"{new}_joint"')
+    robot = tmp_path / "named.urdf"
+    robot.write_text(text)
+    columns = {f"{names[k]} [deg]": np.rad2deg(q[:, k]) for k in (3, 0, 5, 1, 4, 2)}
+    columns |= {f"{axis} [mm]": 1e3 * points[:, 0, k] for k, axis in enumerate("XYZ")}
+    (found,) = _read(robot, [_table(tmp_path / "run.csv", columns)], tmp_path)
+    np.testing.assert_allclose(found.position, q, rtol=0, atol=1e-9)
+    assert not holds("elbow [deg]", "elbow_joint", ("elbow_joint", "joint_elbow"))
+    assert not holds("wrist_x", "wrist_joint", ("wrist_joint",))  # of a point
 
 
 def test_a_board_seen_by_a_camera_in_the_hand_is_told_from_a_measured_pose(measured, tmp_path: Path):

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from ..errors import InputError
 from ..rigid.model import RobotModel
+from .column_names import WORDS, holds, numbers_in, one_set, words_of
 from .dataset import Driven
 from .joined import in_halves
 from .reading import BAGS, episodes_of, kind_of, read_table
@@ -26,34 +27,13 @@ __all__ = [
     "Commands",
     "Undecided",
     "column_kinds",
-    "holds",
     "of_joints",
     "read_columns",
     "read_commands",
     "read_tables",
     "without_sign",
-    "words_of",
 ]
 
-_WORDS = {
-    "command": {
-        "cmd",
-        "command",
-        "commanded",
-        "des",
-        "desired",
-        "target",
-        "ref",
-        "reference",
-        "setpoint",
-        "goal",
-        "action",
-    },
-    "velocity": {"dq", "qd", "vel", "velocity", "velocities", "speed", "qdot", "v"},
-    "current": {"i", "current", "currents", "cur", "amp", "amps", "percent", "load"},
-    "torque": {"tau", "torque", "torques", "effort", "efforts", "eff", "trq", "moment", "moments", "force"},
-    "position": {"q", "pos", "position", "positions", "angle", "angles", "theta", "state"},
-}
 _FEW_STEPS, _ALIKE = 20, 0.9  # rows of a clock, and the share of its steps that are alike
 _TIMES = ("t", "time", "timestamp", "timestamps", "stamp", "stamps", "sec", "seconds", "clock", "header.stamp")
 _CLOCKS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -235,11 +215,6 @@ def _unit_of_current(source: Any) -> str:
     return "%" if words & {"percent", "load"} else "mA" if "ma" in words else "A"
 
 
-def words_of(name: str) -> list[str]:
-    """The words of a column's name in small letters: `jointPos_1 [deg]` holds joint, pos and deg."""
-    return [word for word in re.split(r"[^a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()) if word]
-
-
 def _time(table: Table) -> str:
     names = [name for name in table.names if name not in table.pieces]
     found = [name for name in names if name.lower() in _TIMES] or [name for name in names if in_halves(name)]
@@ -345,12 +320,12 @@ def column_kinds(table: Table, clock: str | None) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for name in table.names:
         words = set(_PRESENT.sub("", " ".join(words_of(name))).split())
-        kind = next((k for k, known in _WORDS.items() if known & words), None)
+        kind = next((k for k, known in WORDS.items() if known & words), None)
         kind = name.partition(".")[0] if name.partition(".")[0] in _OF_BAGS else kind
         told = name == clock or name in table.pieces or _has_parts(name, table.names)
         if not told and kind is not None and not _of_another_topic(name) and table.words(name) is None:
             found.setdefault("torque" if kind == "effort" else kind, []).append(name)
-    positions = [name for name in found.get("position", ()) if set(words_of(name)) & _WORDS["position"] - {"state"}]
+    positions = [name for name in found.get("position", ()) if set(words_of(name)) & WORDS["position"] - {"state"}]
     if positions and "position" in found:  # `state` is the mode of the controller there
         found["position"] = positions
     claimed = {name for names in found.values() for name in names} | {clock}
@@ -360,7 +335,7 @@ def column_kinds(table: Table, clock: str | None) -> dict[str, list[str]]:
     return {kind: _plainest(names) for kind, names in found.items()}
 
 
-_OTHERS = "|".join(sorted(_WORDS["position"] | _WORDS["velocity"] | _WORDS["torque"]))
+_OTHERS = "|".join(sorted(WORDS["position"] | WORDS["velocity"] | WORDS["torque"]))
 _PRESENT = re.compile(rf"\bcurrent (?=(?:{_OTHERS})\b)")  # `current_position` is where the joint is now, not a current
 _OF_BAGS = ("position", "velocity", "effort", "command")
 
@@ -432,9 +407,9 @@ def of_joints(
         if rows == len(wanted) != count and count > rows:
             raise InputError(f"{table.file}: '{source}' has shape ({rows}, {count}): samples are rows; transpose it")
     else:
-        numbered = sorted(columns, key=_number)
+        numbered = sorted(columns, key=numbers_in)
         prefixes = {re.sub(r"\d+", "#", name) for name in columns}
-        if joints is not None and len(columns) == len(wanted) and _one_set(columns):
+        if joints is not None and len(columns) == len(wanted) and one_set(columns):
             _refuse_misplaced(table, columns, wanted, model)
             numbered = columns if len(prefixes) > 1 else numbered
         elif len(prefixes) > 1 and len(columns) > 1:
@@ -491,7 +466,7 @@ def _of_driven(
     alike = len({re.sub(r"\d+", "#", name) for name in columns}) == 1
     count = table.read(columns[0]).shape[1] if whole else len(columns)
     of = tuple(wanted if count == len(wanted) else joints)
-    inside = sorted(columns, key=_number) if alike else columns
+    inside = sorted(columns, key=numbers_in) if alike else columns
     names = {joint: {joint}.union(*(one.drives for one in driven if one.joint == joint)) for joint in joints}
     every = [name for each in names.values() for name in each]
     held = [{joint for joint in joints if any(holds(c, name, every) for name in names[joint])} for c in inside]
@@ -502,18 +477,9 @@ def _of_driven(
             f" has {len(joints)} joint{'s'[: len(joints) != 1]} ({', '.join(joints)}){few}; give one column for each"
             f" joint with a drive, with that joint in its name, as cmd_{wanted[0]}"
         )
-    if not whole and not alike and not _one_set(columns):
+    if not whole and not alike and not one_set(columns):
         raise InputError(f"{table.file}: several sets of columns look like a command: {', '.join(columns[:8])}")
     return of, columns[0] if whole else inside, False
-
-
-def _one_set(columns: Sequence[str]) -> bool:
-    """Whether names differ in one word alone, so that they are one quantity of several joints: `state.a`, `state.b`."""
-    parts = [re.split(r"(?<=[._/ \[])|(?=[._/ \]])", name) for name in columns]
-    head = next((k for k, words in enumerate(zip(*parts, strict=False)) if len(set(words)) > 1), 0)
-    back = zip(*(reversed(words) for words in parts), strict=False)
-    tail = next((k for k, words in enumerate(back) if len(set(words)) > 1), 0)
-    return len(set(columns)) == len(columns) and head + tail > 0
 
 
 def _refuse_misplaced(table: Table, columns: Sequence[str], joints: Sequence[str], model: RobotModel) -> None:
@@ -525,17 +491,6 @@ def _refuse_misplaced(table: Table, columns: Sequence[str], joints: Sequence[str
                 f"{table.file}: --joints names {joint} where the columns have '{column}'; their order is"
                 f" {', '.join(columns)}"
             )
-
-
-def holds(column: str, joint: str, names: Sequence[str]) -> bool:
-    """Whether a column's name holds a joint's, and no longer joint name that contains it."""
-    own = re.search(rf"(?<![A-Za-z0-9]){re.escape(joint)}(?![A-Za-z0-9])", column)
-    longer = [n for n in names if n != joint and joint in n and n in column]
-    return own is not None and not longer
-
-
-def _number(name: str) -> tuple[int, ...]:
-    return tuple(int(digits) for digits in re.findall(r"\d+", name))
 
 
 def _matrix(table: Table, source: Any, joints: Sequence[str], key: str) -> Float[np.ndarray, "samples joints"]:
@@ -640,7 +595,7 @@ def _command_columns(
     for kind in wanted:
         found = kinds.get(kind, [])
         if kind == "command" and "torque" in wanted:
-            found = [name for name in found if not (_WORDS["position"] | _WORDS["velocity"]) & set(words_of(name))]
+            found = [name for name in found if not (WORDS["position"] | WORDS["velocity"]) & set(words_of(name))]
         if found:
             return found
     plain = [name for name in table.names if re.fullmatch(r"(u|ctrl)([._\[]*\d+\]?)?", name)]
@@ -670,5 +625,5 @@ def _of_drives(
             f"{table.file}: {count} columns of a command ({', '.join(columns[:12])}), but the model has {len(drives)}"
             f" drives: {', '.join(drives)}; name one column for each"
         )
-    ordered = columns if in_order else sorted(columns, key=_number)
+    ordered = columns if in_order else sorted(columns, key=numbers_in)
     return _matrix(table, columns[0] if whole else list(ordered), drives, "command")

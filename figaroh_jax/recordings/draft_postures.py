@@ -21,7 +21,8 @@ from ..formats.config import load_task
 from ..formats.robotfile import impossible_said, read_robot
 from ..rigid.kinematics import poses_on_host
 from ..rigid.model import RobotModel, prismatic
-from .draft_columns import column_kinds, holds, of_joints, words_of
+from .column_names import holds, words_of
+from .draft_columns import column_kinds, of_joints
 from .draft_text import locked_said, place_said
 from .poses import PoseRecording, read_pose_recordings
 from .starts import place_points, place_poses
