@@ -136,6 +136,17 @@ def _held(times: int) -> Spoil:
     return spoil
 
 
+def _twice(base: Base, arrays: Arrays, entry: Entry) -> None:
+    """Three rows are there twice, and no stamps say so."""
+    n = len(arrays["q"])
+    rows = np.sort(np.append(np.arange(n), [n // 4, n // 2, 3 * n // 4]))
+    for key in ("q", "dq", "tau"):
+        if key in arrays:
+            arrays[key] = arrays[key][rows]
+    entry["rate"] = float((n - 1) / np.ptp(arrays["t"]))
+    del entry["time"]
+
+
 def _coarse(base: Base, arrays: Arrays, entry: Entry) -> None:
     step = np.ptp(arrays["q"], axis=0).max() / 15
     arrays["q"] = np.round(arrays["q"] / step) * step
@@ -250,6 +261,7 @@ KINDS: dict[str, tuple[Spoil, str]] = {
     "one spike of 1e3 rad": (_row("q", 1e3), r"jumps by .* in row"),
     "lost packets as zeros": (_lost, r"zero at every joint in row|jumps by .* in row"),
     "encoder wraps around": (_wrapped, r"unwrap|limits"),
+    "three rows twice": (_twice, r"in row \d+ \(from 0\) and 2 more are those of the row before"),
     "every row four times": (_held(4), r"every row appears 4 times"),
     "coarse position": (_coarse, r"comes in steps"),
     "never moves": (_still, r"no joint moves"),

@@ -122,7 +122,7 @@ def check_recording(recording: Recording, model: RobotModel, entry: RecordingEnt
         found += check(look)
     if any(finding.wrong for finding in found):
         return [finding for finding in found if finding.wrong]  # the rest follows from these
-    for check in (_velocity, _speeds, _held_samples, _coarse, _clipped):
+    for check in (_velocity, _speeds, _held_samples, _written_twice, _coarse, _clipped):
         found += check(look)
     if motion is not None and recording.torque is not None and not _stands(recording):
         sound = _soundest(look)
@@ -368,6 +368,34 @@ def _held_samples(look: Look) -> Iterator[Finding]:
         f"every row appears {times:.0f} times: values were sampled at about {rate / times:.4g} Hz and held, the stamps"
         f" say {rate:.4g} Hz; keep one row of each",
     )
+
+
+def _written_twice(look: Look) -> Iterator[Finding]:
+    """Rows that repeat the one before them bit by bit, while the motion goes on as if they were not there.
+
+    Of a value that was held, the next step makes up for it.
+    """
+    torque = look.recording.torque
+    if torque is None:
+        return
+    steps = np.diff(look.position, axis=0)
+    same = (steps == 0).all(axis=1) & (np.diff(torque, axis=0) == 0).all(axis=1)
+    at = np.flatnonzero(same[_BESIDE : len(same) - _BESIDE]) + _BESIDE
+    near = steps[at[:, None] + np.delete(np.arange(-_BESIDE, _BESIDE + 1), _BESIDE)]  # (rows, steps, joints)
+    other = np.delete(near, _BESIDE, axis=1).mean(axis=1)  # all but the one that would make up for it
+    square = (other**2).sum(axis=1)
+    share = np.einsum("rsj,rj->rs", near, other) / np.where(square > 0, square, 1.0)[:, None]
+    rows = at[(np.abs(share - 1) < 0.5).all(axis=1)] + 1
+    if len(rows):
+        yield Finding(
+            False,
+            f"position and torque of every joint in row {look.row(rows[0])} (from 0){and_more(rows)} are those of the"
+            " row before, and the motion goes on as if that row were not there: what is written twice makes all that"
+            " follows late; delete these rows",
+        )
+
+
+_BESIDE = 4  # steps at either side of a row
 
 
 def _coarse(look: Look) -> Iterator[Finding]:
