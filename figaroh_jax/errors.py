@@ -40,7 +40,7 @@ def check_real(name: str, array: Any) -> None:
                 raise
             return
     if kind not in "biufV":  # V: bfloat16 and the like
-        held = {"c": "complex numbers", "U": "text", "S": "bytes", "O": "objects", "R": "records"}.get(
+        held = {"c": "complex numbers", "U": "text", "S": "bytes", "O": "objects", "R": "records", "M": "dates"}.get(
             kind, f"data of kind '{kind}'"
         )
         raise InputError(f"{name} holds {held}; real numbers are expected")

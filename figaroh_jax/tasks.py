@@ -11,6 +11,7 @@ from .errors import InputError, check_each, check_positive, nearest
 from .formats.config import Preprocess, Task
 from .formats.taskfile import check_effects
 from .recordings.checks import Checked, checked_recordings
+from .recordings.dataset import named
 from .recordings.posture_checks import check_pose_recordings
 from .simulators.native import as_backend
 
@@ -133,6 +134,7 @@ def diagnose(
         if option not in known_options:
             raise InputError(f"diagnose has no argument '{option}'{nearest(option, known_options)}")
     torques: Any = recordings
+    torques = named(torques, as_backend(model).robot)
     warnings, contradictions = _checked(model, torques)
     options = {"contradictions": contradictions} | options
     settings = {"trust": trust, "forbid": forbid, "alpha": alpha, "progress": progress, **options}

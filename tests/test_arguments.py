@@ -108,6 +108,20 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: ANY.recording(q=Q, tau=Q, rate=100, load=2.0),
         r"load is of type float; a Load .* fj.Load\(frame=",
     ),
+    "prior of no size": (
+        lambda: fj.fit(MODEL, DATA, "inertia", prior={"inertia": 0.0}),
+        "'inertia' is 0.0; .*above zero",
+    ),
+    "prior of nan": (
+        lambda: fj.fit(MODEL, DATA, "inertia", prior={"inertia": np.nan}),
+        "'inertia' is nan; .*above zero",
+    ),
+    "prior below zero": (lambda: fj.fit(MODEL, DATA, "inertia", prior={"inertia": -0.1}), "'inertia' is -0.1; .*zero"),
+    "kind of a prior": (lambda: fj.fit(MODEL, DATA, "effects", prior={"x": 1.0}), "'x' is not free; free are effects"),
+    "infinite noise": (lambda: fj.torque_data(ROBOT, RUN, noise=np.inf), "noise is inf; one sigma above zero"),
+    "gate": (lambda: fj.torque_data(ROBOT, RUN, fj.Preprocess(gate={"elbo": 0.1})), "gate: no .*mean 'elbow'"),
+    "milliseconds": (lambda: fj.recording(q=Q, tau=Q, time=4.0 * np.arange(300)), "stamps look like ms: add"),
+    "dates": (lambda: ANY.recording(q=Q, tau=Q, time=TIME.astype("datetime64[s]")), "time holds dates; real"),
     "switch": (lambda: ANY.calibrate(ROBOT, [SEEN], priors="no"), "priors is the text 'no'; True or False is expected"),
     "check": (lambda: ANY.identify(ROBOT, [RUN], check="no"), "check is the text 'no'; True or False"),
     "kinematic": (lambda: ANY.load_urdf(fj.DEMO, kinematic=1), "kinematic is 1; True or False"),
@@ -242,6 +256,11 @@ def test_a_wrong_argument_is_named(name: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # which users do not have in between
     with pytest.raises(fj.InputError, match=message):
         call()
+
+
+def test_a_gate_names_the_robots_joint_where_columns_have_no_names():
+    data: Any = fj.torque_data(ROBOT, RUN, fj.Preprocess(cutoff=10, gate={"elbow": 1e3}))
+    assert (data.weight.sum(axis=(0, 1)) > 0).tolist() == [True, True, False, True]
 
 
 def test_a_plain_robot_is_predicted_and_simulated():

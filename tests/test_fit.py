@@ -107,6 +107,8 @@ def test_limits_hold_and_a_prior_pulls(robot: fj.RobotModel, tracked: tuple[fj.P
     [
         ("joint_offsets", "'joint_offsets' — did you mean|nothing is called 'joint_offsets'"),
         ({"joint_offset": ["knee"]}, "none at"),
+        ({"joint_offset": ["elbow", "wrst"]}, "joint_offset: none at 'wrst'; did you mean 'wrist'"),
+        ({"joint_offset": False}, "joint_offset is False; True is expected, or its places"),
         ("friction", "the model and the data have none"),
         ({"friction": ["elbow"]}, "the model and the data have none; give the model some: extend"),
         ((), "nothing is named"),

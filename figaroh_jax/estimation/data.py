@@ -29,7 +29,7 @@ from ..effects.kinematic import PostureMotion, Postures, twists_of
 from ..errors import InputError, check_each, check_kind, check_real
 from ..recordings.arrays import check_accuracy
 from ..recordings.checks import check_columns, position_findings, report_findings
-from ..recordings.dataset import Recording
+from ..recordings.dataset import Recording, named
 from ..recordings.devices import Device
 from ..recordings.poses import PoseRecording
 from ..recordings.rowfilter import filtered
@@ -233,13 +233,13 @@ def torque_data(
     given = [recordings] if isinstance(recordings, Recording) else recordings
     check_each("recordings", given, Recording, "`recording` makes one of arrays")
     check_each("preprocess", [preprocess or Preprocess()], Preprocess, "Preprocess(cutoff=15), in Hz, say")
-    fitted = [one for one in given if one.role == "fit"]
+    fitted = named([one for one in given if one.role == "fit"], robot)
     lacking = next((one for one in fitted if one.torque is None), None)
     if not fitted or lacking is not None:
         raise InputError(f"{lacking.file} has no torque" if lacking else "no recording to fit: all have role holdout")
     _belong(robot, fitted)
     check_real("noise", noise)
-    if np.shape(noise) not in ((), (robot.nv,)) or not (np.asarray(noise) > 0).all():
+    if np.shape(noise) not in ((), (robot.nv,)) or not (np.isfinite(noise) & (np.asarray(noise) > 0)).all():
         raise InputError(f"noise is {noise!r:.100}; one sigma above zero is expected (N m or N), or one for each joint")
     signals = prepare_all(tuple(fitted), preprocess or Preprocess(), band=None, model=robot, sticks=False)
     records = stack(signals, robot)

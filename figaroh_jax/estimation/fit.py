@@ -272,6 +272,8 @@ def _precision(free: Free, model: ExtendedModel, prior: Mapping[str, Any]) -> Fl
         unused -= {kind} | ({"friction"} if kind == "effects" else set())
         if sigma is not None:
             check_real(f"prior: sigma of '{kind}'", sigma)
+            if not traced(sigma) and not (np.asarray(sigma, float) > 0).all():
+                raise InputError(f"prior: sigma of '{kind}' is {sigma}; expected numbers above zero")
         if sigma is None:
             out.append(np.zeros(len(part.index)))
         elif kind == "inertia" and np.ndim(sigma) == 0:
@@ -282,11 +284,10 @@ def _precision(free: Free, model: ExtendedModel, prior: Mapping[str, Any]) -> Fl
             out.append(rigid_prior(model.robot, float(sigma))[1][np.array(part.index)])
         else:
             whole = np.broadcast_to(np.asarray(sigma, float), part.shape).reshape(-1)
-            if not (whole[np.array(part.index)] > 0).all():
-                raise InputError(f"prior: sigma of '{kind}' is {sigma}; expected numbers above zero")
             out.append(whole[np.array(part.index)] ** -2.0)
     if unused:
-        raise InputError(f"prior: '{sorted(unused)[0]}' is not free; free are {sorted({p.kind for p in free.parts})}")
+        kinds = sorted({known.get(part.kind, part.kind) for part in free.parts})
+        raise InputError(f"prior: '{sorted(unused)[0]}' is not free; free are {', '.join(kinds)}")
     return np.concatenate(out)
 
 

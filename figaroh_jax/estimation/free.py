@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 
 from ..effects.base import Effect
 from ..effects.extended import ExtendedModel
-from ..errors import InputError, nearest
+from ..errors import InputError, check_kind, nearest
 from ..rigid import lie
 from ..rigid.model import DOF_NAMES, RobotModel
 
@@ -142,6 +142,7 @@ def chosen_of(model: ExtendedModel, data: Sequence[Data], free: Any) -> Free:
         if kind not in KINDS:
             raise InputError(f"free: nothing is called '{kind}'{nearest(kind, KINDS)}; known: {', '.join(KINDS)}")
         given = list(_parts(kind, model, data))
+        _check_places(kind, places, given)
         chosen = given if places is True else [p for p in (_only(part, places) for part in given) if p.index]
         if not chosen:
             what = "the model and the data have none" if places is True or not given else f"none at {places}"
@@ -155,6 +156,22 @@ def chosen_of(model: ExtendedModel, data: Sequence[Data], free: Any) -> Free:
     if double:
         raise InputError("free: 'effects' holds 'friction' already; give one of them")
     return Free(tuple(parts))
+
+
+def _check_places(kind: str, places: Any, parts: Sequence[Part]) -> None:
+    """Refuse what is neither True nor places, and a place among others at which the kind has no number."""
+    if places is True or isinstance(places, np.ndarray):
+        return
+    if not isinstance(places, Iterable):
+        raise InputError(
+            f"free: {kind} is {places!r:.100}; True is expected, or its places; leave out what is not free"
+        )
+    words = [own for part in parts for own in part.words or [tuple(name.split()) for name in part.names]]
+    for place in [] if isinstance(places, str) else places:
+        check_kind(f"free: {kind}", place, str, "a list of names of places")
+        if words and not any(_said(place, own) for own in words):
+            known = dict.fromkeys(word for own in words for word in own[1:] if word)
+            raise InputError(f"free: {kind}: none at '{place}'{nearest(place, known)}")
 
 
 def _only(part: Part, places: Any) -> Part:

@@ -62,7 +62,8 @@ def select(
     `prior` as for `fit`, `free` what is fitted beside the causes. Rows are cut into 20 stretches, left out in five
     groups. A cause is taken where a paired test over the stretches (t, or signed ranks) is below `alpha`, divided by
     the number of candidates, and its size is one that physics allows. Rows should not be correlated over a stretch's
-    length. Answers `named` or `nothing`; `solution` is the fit of all.
+    length. After `most` causes the search ends: what is still missing then is in their numbers. Answers `named` or
+    `nothing`; `solution` is the fit of all.
 
     >>> import numpy as np, figaroh_jax as fj
     >>> robot, t = fj.load_urdf(fj.DEMO), np.arange(1500)[:, None] / 250.0

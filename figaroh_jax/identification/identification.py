@@ -30,7 +30,7 @@ from ..estimation.regression import Condensed, Regression, condense
 from ..formats.robotfile import load_robot, stated_baseline
 from ..recordings.bandwidth import note_on
 from ..recordings.checks import check_recordings
-from ..recordings.dataset import Recording, read_recordings
+from ..recordings.dataset import Recording, named, read_recordings
 from ..recordings.signals import Resampled, Signals, as_slow_as_torque, kept_out_in_vain, prepare_all
 from ..rigid.model import DOF_NAMES, RobotModel, prismatic
 from ..simulators.contract import Backend
@@ -187,6 +187,7 @@ def identify(
         raise InputError("recordings is empty: there is nothing to fit")
     backend = as_backend(model)
     model = backend.robot
+    recordings = named(recordings, model)
     warned = check_recordings(None, model, recordings) if check else ()
     with jax.enable_x64(True):
         progress("preparing signals", 0.05)

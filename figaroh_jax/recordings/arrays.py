@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ..errors import InputError, check_kind, check_names, check_one_of, check_positive, check_real, nearest
 from ..rigid.model import RobotModel
 from . import poses
-from .dataset import Memory, Recording, check_order, unit_factors
+from .dataset import Memory, Recording, check_order, unit_factors, unnamed
 from .devices import Device
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["postures", "recording"]
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_SLOWEST = 5.0  # s between samples
+_SLOWEST = 1.5  # s between samples
 KINDS = ("pose", "position", "plane", "socket", "camera", "device")
 
 
@@ -74,7 +74,7 @@ def recording(
     if wrong:
         raise InputError(f"{source}: {wrong} has {len(arrays[wrong])} samples, but q has {samples}")
     columns = next((arrays[key].shape[1] for key in ("tau", "v") if key in arrays), arrays["q"].shape[1])
-    names = names or tuple(f"joint {k + 1}" for k in range(columns))
+    names = names or unnamed(columns)
     if joints and model is not None:
         check_order(source, names, model)
     _check_columns(arrays, names, model, source)

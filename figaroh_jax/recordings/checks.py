@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from ..errors import InputError
 from ..rigid.model import RobotModel, prismatic
-from .dataset import Memory, Recording, carrying, check_order
+from .dataset import Memory, Recording, carrying, check_order, unnamed
 from .findings import LIKE, SOFT, UNLIKE, Finding, Look, and_more, effort_unit, named, unit_of
 from .likeness import sampled
 from .torque_checks import torque_findings
@@ -160,8 +160,7 @@ def check_columns(recording: Recording, model: RobotModel) -> None:
             f" {model.nq} numbers of position ({', '.join(model.joint_names)}); joints that stand still are left out by"
             " load_urdf(..., joints=[...])"
         )
-    unnamed = tuple(f"joint {k + 1}" for k in range(len(recording.joints)))  # as `recording` calls them
-    if isinstance(recording.file, Memory) and recording.joints != unnamed:
+    if isinstance(recording.file, Memory) and recording.joints != unnamed(len(recording.joints)):
         check_order(recording.file, recording.joints, model, all_known=False)
 
 

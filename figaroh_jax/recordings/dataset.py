@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -38,9 +38,11 @@ __all__ = [
     "carrying",
     "check_order",
     "joint_columns",
+    "named",
     "read_recordings",
     "read_time",
     "unit_factors",
+    "unnamed",
 ]
 
 
@@ -165,6 +167,17 @@ def _check_names(task: Task, model: RobotModel, floating: bool, what: str) -> No
         if entry.load is not None and entry.load.frame not in {*frames, *model.link_names}:
             place = f"{task.file}: data[{k}].load.frame"
             raise InputError(f"{place}: robot has no frame '{entry.load.frame}'{nearest(entry.load.frame, frames)}")
+
+
+def unnamed(count: int) -> tuple[str, ...]:
+    """Names of the columns of arrays of which no joints are known."""
+    return tuple(f"joint {k + 1}" for k in range(count))
+
+
+def named(recordings: Sequence[Recording], model: RobotModel) -> tuple[Recording, ...]:
+    """Recordings from arrays with the names of the robot's joints where their columns have none."""
+    names = model.dof_names
+    return tuple(replace(one, joints=names) if one.joints == unnamed(len(names)) else one for one in recordings)
 
 
 def check_order(source: Memory | Path, names: Sequence[str], model: RobotModel, *, all_known: bool = True) -> None:

@@ -19,7 +19,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..errors import InputError
+from ..errors import InputError, nearest
 from .bandwidth import Band, encoder_step, motion_band, smoothed
 from .cleaning import near, without_untrusted
 from .dataset import Recording
@@ -471,6 +471,9 @@ def _weight(recording: Recording, preprocess: Preprocess, rows: RowFilter, veloc
     for begin, end in _long(gaps, cutoff):
         weight[(rows.row_times > begin - reach) & (rows.row_times < end + reach)] = 0.0
     for joint, least in preprocess.gate.items():
+        if joint not in recording.joints:
+            hint = nearest(joint, recording.joints)
+            raise InputError(f"{recording.file}: preprocess.gate: no moving joint '{joint}'{hint}")
         column = recording.joints.index(joint)
         weight[np.abs(velocity[rows.index, column]) < least, column] = 0.0
     return weight
