@@ -33,12 +33,12 @@ def check_real(name: str, array: Any) -> None:
 
         try:
             kind = np.asarray(array).dtype.kind
-        except (TypeError, ValueError) as error:  # rows of different lengths
-            raise InputError(f"{name} is not an array of numbers: {str(error)[:200]}") from None
-        except Exception as error:  # a list of what JAX traces: NumPy may not look into it, JAX checks it later
-            if type(error).__module__.partition(".")[0] != "jax":
+        except Exception as error:
+            if type(error).__module__.partition(".")[0] == "jax":
+                return  # a list of what JAX traces: NumPy may not look into it, JAX checks it later
+            if not isinstance(error, (TypeError, ValueError)):
                 raise
-            return
+            raise InputError(f"{name} is not an array of numbers: {str(error)[:200]}") from None  # rows of many lengths
     if kind not in "biufV":  # V: bfloat16 and the like
         held = {"c": "complex numbers", "U": "text", "S": "bytes", "O": "objects", "R": "records", "M": "dates"}.get(
             kind, f"data of kind '{kind}'"

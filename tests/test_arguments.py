@@ -6,11 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jaxtyping
 import numpy as np
 import pytest
 
 import figaroh_jax as fj
+from figaroh_jax.errors import check_real
 from figaroh_jax.rigid.dynamics import refuse_singular
 
 ROBOT = fj.load_urdf(fj.DEMO)
@@ -261,6 +263,11 @@ def test_a_wrong_argument_is_named(name: str, monkeypatch: pytest.MonkeyPatch):
 def test_a_gate_names_the_robots_joint_where_columns_have_no_names():
     data: Any = fj.torque_data(ROBOT, RUN, fj.Preprocess(cutoff=10, gate={"elbow": 1e3}))
     assert (data.weight.sum(axis=(0, 1)) > 0).tolist() == [True, True, False, True]
+
+
+def test_a_list_of_what_jax_traces_is_no_wrong_argument():
+    """NumPy may not look into it."""
+    assert jax.grad(lambda x: [check_real("q", [x, 0.0]), 2.0 * x][1])(1.0) == 2.0
 
 
 def test_a_plain_robot_is_predicted_and_simulated():

@@ -3,6 +3,7 @@
 # ruff: noqa: E501 - robots stand here as lines of XML
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import equinox as eqx
@@ -12,6 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import figaroh_jax as fj
 from figaroh_jax.errors import InputError
 from figaroh_jax.rollouts.reading import load_loop
 from figaroh_jax.rollouts.simulation import delayed, rollout
@@ -254,6 +256,22 @@ def test_gradients_are_those_of_finite_differences(tmp_path: Path):
             (float(value(at + h * e)) - float(value(at - h * e))) / (2 * h) for h, e in zip(step, eye, strict=True)
         ]
     np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-7 * np.abs(numeric).max())
+
+
+def test_gradients_with_the_64_bit_mode_off_are_those_of_finite_differences():
+    """JAX's default: float32 goes in and comes out, float64 between."""
+    drives = {name: {"kind": "position", "kp": 60.0, "kd": 4.0} for name in ("shoulder", "elbow")}
+    loop, _ = load_loop(fj.DEMO, drives, joints=["shoulder", "elbow"], dt=0.01)
+    u, start = 0.3 * np.sin(0.2 * np.arange(20)[:, None] + np.arange(2)), np.array([0.1, 0.2])
+    with jax.enable_x64(False), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        slope = np.asarray(jax.grad(lambda u: rollout(loop, u, start).reading.sum())(jnp.asarray(u)))
+    assert slope.dtype == np.float32
+    for row, column in ((0, 0), (5, 1), (12, 0)):
+        step = np.zeros_like(u)
+        step[row, column] = 1e-5
+        ends = [np.asarray(rollout(loop, u + k * step, start).reading).sum() for k in (1, -1)]
+        assert slope[row, column] == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4)
 
 
 def test_a_delay_is_the_mean_of_the_held_command():

@@ -12,6 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..compiled.batching import filtered_program, traced
+from ..compiled.precision import in_float64
 from ..errors import InputError, check_real
 from ..rigid.kinematics import check_shapes
 from . import own
@@ -53,22 +54,25 @@ def rollout(
             f"loop is of type {type(loop).__name__}; `load_loop` makes one of a robot's file and its drives"
         )
     check_real("command", command)
-    with jax.enable_x64(True):
-        u = jnp.asarray(command, jnp.float64)
-        count = len(loop.drives.names)
-        if u.ndim != 2 or u.shape[1] != count:
-            names = ", ".join(loop.drives.names)
-            raise InputError(f"command has shape {u.shape}; one row for each step, one column for each of: {names}")
-        velocity = jnp.zeros(loop.robot.nv) if velocity is None else velocity
-        check_shapes(loop.robot, q=position, v=velocity)
-        q, v = (jnp.asarray(x, jnp.float64) for x in (position, velocity))
-        found = _rollout(loop, u, q, v)
-        if not traced(found.reading):
-            _refuse_divergence(loop, found, command=u, position=q, velocity=v)
-        return found
+    u = _array(command)
+    if u.ndim != 2 or u.shape[1] != len(loop.drives.names):
+        names = ", ".join(loop.drives.names)
+        raise InputError(f"command has shape {u.shape}; one row for each step, one column for each of: {names}")
+    velocity = np.zeros(loop.robot.nv) if velocity is None else velocity
+    check_shapes(loop.robot, q=position, v=velocity)
+    q, v = _array(position), _array(velocity)
+    found = in_float64(_rollout)(loop, u, q, v)
+    if not traced(found.reading):
+        _refuse_divergence(loop, found, command=u, position=q, velocity=v)
+    return found
 
 
-def _refuse_divergence(loop: Loop, found: Rollout, **given: Array) -> None:
+def _array(x: Any) -> Any:
+    """What JAX traces as it is, all else in float64."""
+    return jnp.asarray(x) if traced(x) else np.asarray(x, float)
+
+
+def _refuse_divergence(loop: Loop, found: Rollout, **given: Any) -> None:
     wrong = np.argwhere(~(np.abs(np.asarray(found.velocity)) < 1e6))
     if len(wrong):
         for name, array in given.items():
