@@ -124,6 +124,8 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "gate": (lambda: fj.torque_data(ROBOT, RUN, fj.Preprocess(gate={"elbo": 0.1})), "gate: no .*mean 'elbow'"),
     "milliseconds": (lambda: fj.recording(q=Q, tau=Q, time=4.0 * np.arange(300)), "stamps look like ms: add"),
     "dates": (lambda: ANY.recording(q=Q, tau=Q, time=TIME.astype("datetime64[s]")), "time holds dates; real"),
+    "nan start": (lambda: fj.simulate(MODEL, Q, Q[0], np.full(4, np.nan), 0.01), "velocity holds nan; finite numbers"),
+    "nan torque": (lambda: fj.simulate(MODEL, Q * np.inf, Q[0], Q[0], 0.01), "command holds .*; finite numbers are"),
     "switch": (lambda: ANY.calibrate(ROBOT, [SEEN], priors="no"), "priors is the text 'no'; True or False is expected"),
     "check": (lambda: ANY.identify(ROBOT, [RUN], check="no"), "check is the text 'no'; True or False"),
     "kinematic": (lambda: ANY.load_urdf(fj.DEMO, kinematic=1), "kinematic is 1; True or False"),

@@ -368,6 +368,32 @@ def test_mujoco_and_our_simulation_stay_together(model: RobotModel, tmp_path: Pa
     assert coarse / fine == pytest.approx(2.0, rel=0.2)
 
 
+def test_a_model_that_no_file_can_hold_and_a_place_that_is_none_are_told(model: RobotModel, tmp_path: Path):
+    inertia = np.asarray(model.inertia).copy()
+    inertia[1, 2] = np.nan
+    wrong = eqx.tree_at(lambda m: m.inertia, model, inertia)
+    with pytest.raises(InputError, match=rf"inertia of link '{model.link_names[1]}' holds nan"):
+        fj.write_model(wrong, tmp_path / "model")
+    assert not (tmp_path / "model").exists()
+    (tmp_path / "note").write_text("mine")
+    for where in ("note", "note/model"):
+        with pytest.raises(InputError, match="cannot be written: .*; name another folder"):
+            fj.write_model(model, tmp_path / where)
+    assert (tmp_path / "note").read_text() == "mine"
+
+
+def test_a_users_loop_is_not_replaced(tmp_path: Path):
+    loop, _ = fj.load_loop(fj.DEMO, {"elbow": {"kind": "torque"}}, joints=["elbow"])
+    (tmp_path / "loop.json").write_text('{"name": "mine"}')
+    with pytest.raises(InputError, match=r"loop\.json is there and is none that write_loop wrote"):
+        fj.write_loop(loop, tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["loop.json"]
+    (tmp_path / "loop.json").unlink()
+    fj.write_loop(loop, tmp_path)
+    fj.write_loop(loop, tmp_path)  # its own
+    assert fj.read_loop(tmp_path).robot.dof_names == ("elbow",)
+
+
 def test_a_users_file_is_not_replaced(tmp_path: Path):
     model = load_urdf(fj.DEMO)
     own = tmp_path / "robot.urdf"

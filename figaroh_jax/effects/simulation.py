@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from ..compiled.precision import in_float64
-from ..errors import InputError, check_count
+from ..errors import InputError, check_count, check_finite
 from ..rigid.dynamics import inverse_dynamics
 from ..rigid.kinematics import states
 from ..rigid.model import RobotModel
@@ -85,12 +85,15 @@ def simulate(
     q, v = states(extended.robot, position=position, velocity=velocity)
     if q.ndim != 1:
         raise InputError(f"position has shape {q.shape}; a simulation starts from one state, map it over several")
+    check_finite("position", q)
+    check_finite("velocity", v)
     if callable(command):
         if steps is None:
             raise InputError("a command that is a function needs the number of steps")
         check_count("steps", steps, 0)
         return _simulate(opened(extended), command, jnp.zeros((steps, q.size)), q, v, jnp.float64(dt))
     torque = states(extended.robot, command=command)[0]
+    check_finite("command", torque)
     if steps is not None:
         check_count("steps", steps, 0)
     if torque.ndim != 2 or (steps is not None and torque.shape[0] < steps):

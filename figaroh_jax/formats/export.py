@@ -21,7 +21,7 @@ from jaxtyping import Int
 from ..effects.base import Effect, joint_unit, place
 from ..effects.catalogue import find
 from ..effects.extended import ExtendedModel, changed_robot, extend
-from ..errors import InputError, check_kind, check_path
+from ..errors import InputError, check_finite, check_kind, check_path
 from ..results import Cause, Estimate, Name
 from ..rigid.model import DOF_NAMES, RobotModel
 from .mjcf_text import mjcf_text
@@ -72,23 +72,31 @@ def write_model(model: ExtendedModel | RobotModel, directory: str | Path, causes
     """
     check_kind("model", model, (ExtendedModel, RobotModel), "write_model(model, directory)")
     check_path("directory", directory)
-    directory = Path(directory)
-    texts = model_files(extend(model) if isinstance(model, RobotModel) else model, causes)
-    directory.mkdir(parents=True, exist_ok=True)
+    _write(model_files(extend(model) if isinstance(model, RobotModel) else model, causes), Path(directory))
+
+
+def _write(texts: Mapping[str, str], directory: Path) -> None:
+    """Write files of a model by their names; `InputError` where others of these names are there, or nothing can be."""
     head = directory / "effects.yaml"
-    if not (head.is_file() and head.read_bytes().startswith(_HEAD.encode())):
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        if not (head.is_file() and head.read_bytes().startswith(_HEAD.encode())):
+            for name, text in texts.items():
+                file = directory / name
+                if file.exists() and not (file.is_file() and file.read_bytes() == text.encode()):
+                    raise InputError(f"{file} is there and is none that write_model wrote; name another folder")
         for name, text in texts.items():
-            file = directory / name
-            if file.exists() and not (file.is_file() and file.read_bytes() == text.encode()):
-                raise InputError(f"{file} is there and is none that write_model wrote; name another folder")
-    for name, text in texts.items():
-        (directory / name).write_text(text, encoding="utf-8")
+            (directory / name).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{directory}: cannot be written: {error.strerror}; name another folder") from error
 
 
 def model_files(extended: ExtendedModel, causes: Sequence[Cause] = ()) -> dict[str, str]:
     """Text of each of the three files by its name (see `write_model`)."""
     with jax.enable_x64(True):
         robot = jax.tree.map(np.asarray, changed_robot(extended))
+        for link, ten in zip(robot.link_names, robot.inertia, strict=True):
+            check_finite(f"model: the inertia of link '{link}'", ten)
         return _files(extended, robot, causes)
 
 

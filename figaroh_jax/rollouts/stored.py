@@ -40,8 +40,20 @@ def write_loop(loop: Loop, directory: str | Path) -> None:
     ['effects.yaml', 'loop.json', 'robot.urdf', 'robot.xml']
     """
     check_kind("loop", loop, Loop, "`load_loop` makes one; write_loop(loop, directory)")
+    check_path("directory", directory)
+    file = Path(directory) / LOOP
+    if file.exists() and not _written(file):
+        raise InputError(f"{file} is there and is none that write_loop wrote; name another folder")
     write_model(extended_of(rigid(loop)), directory)
     add_loop(Path(directory), loop)
+
+
+def _written(file: Path) -> bool:
+    """Whether a file is a `loop.json` of this library."""
+    try:
+        return {"dt", "integrator"} <= set(json.loads(file.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return False
 
 
 def add_loop(folder: Path, loop: Loop) -> None:
