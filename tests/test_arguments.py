@@ -126,6 +126,11 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "dates": (lambda: ANY.recording(q=Q, tau=Q, time=TIME.astype("datetime64[s]")), "time holds dates; real"),
     "nan start": (lambda: fj.simulate(MODEL, Q, Q[0], np.full(4, np.nan), 0.01), "velocity holds nan; finite numbers"),
     "nan torque": (lambda: fj.simulate(MODEL, Q * np.inf, Q[0], Q[0], 0.01), "command holds .*; finite numbers are"),
+    "no posture": (lambda: seen(q=Q[:0], position=Q[:0, :3]), "recording 'postures': q holds no posture"),
+    "no quaternion": (
+        lambda: fj.postures(q=Q, pose=np.zeros((300, 7)), base_frame="base", tool_frame="hand"),
+        "pose, row 0 .from 0.: the quaternion is zero",
+    ),
     "switch": (lambda: ANY.calibrate(ROBOT, [SEEN], priors="no"), "priors is the text 'no'; True or False is expected"),
     "check": (lambda: ANY.identify(ROBOT, [RUN], check="no"), "check is the text 'no'; True or False"),
     "kinematic": (lambda: ANY.load_urdf(fj.DEMO, kinematic=1), "kinematic is 1; True or False"),

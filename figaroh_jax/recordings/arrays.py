@@ -142,6 +142,8 @@ def postures(
         check_positive("distance", distance, "m")
     check_accuracy(accuracy)
     position = _matrix(q, "q", source)
+    if not len(position):
+        raise InputError(f"{source}: q holds no posture")
     known = dict(units or {})
     scale = _unit(known.pop("measurement", "m"), {"m": 1.0, "mm": 1e-3}, "measurement", source)
     position = position * _factors(known.pop("position", "rad"), None, position.shape[1], source)

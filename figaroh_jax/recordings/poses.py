@@ -281,10 +281,12 @@ def poses(values: np.ndarray, table: Any, key: str) -> np.ndarray:
     seen = np.isfinite(rotation[:, 0]).all(axis=1)
     given = rotation[seen, 0]
     if given.shape[1] == 4:
-        off = np.abs(np.linalg.norm(given, axis=1) - 1.0)
-        turned = Rotation.from_quat(
-            given / np.maximum(np.linalg.norm(given, axis=1), 1e-9)[:, None] if len(given) else given
-        )
+        norms = np.linalg.norm(given, axis=1)
+        if (norms < 1e-9).any():
+            row = np.flatnonzero(seen)[np.argmax(norms < 1e-9)]
+            raise InputError(f"{table.file}: {key}, row {row} (from 0): the quaternion is zero; NaN says not measured")
+        off = np.abs(norms - 1.0)
+        turned = Rotation.from_quat(given / norms[:, None] if len(given) else given)
         matrices = turned.as_matrix() if len(given) else np.zeros((0, 3, 3))
     else:
         given = given.reshape(-1, 3, 3)
