@@ -84,6 +84,12 @@ def _a(kind: type | tuple[type, ...]) -> str:
     return " or ".join(f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}" for name in names)
 
 
+def check_callable(name: str, given: Any, hint: str) -> None:
+    """Refuse what cannot be called; the message ends in what would be right."""
+    if not callable(given):
+        raise InputError(f"{name} is {given!r:.100}; a function is expected: {hint}")
+
+
 def check_one_of(name: str, given: Any, known: Sequence[str]) -> None:
     """Refuse what is none of the known words."""
     if given not in known:

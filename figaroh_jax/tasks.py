@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, overload
 
-from .errors import InputError, check_each, check_positive, nearest
-from .formats.config import Preprocess, Task
+from .errors import InputError, check_callable, check_each, check_kind, check_positive, nearest
+from .formats.config import Baseline, Preprocess, Task
 from .formats.taskfile import check_effects
 from .recordings.checks import Checked, checked_recordings
 from .recordings.dataset import named
@@ -17,7 +17,6 @@ from .simulators.native import as_backend
 
 if TYPE_CHECKING:
     from .calibration.kinematic_diagnosis import PoseDiagnosis
-    from .formats.config import Baseline
     from .identification.result import Identification
     from .recordings.dataset import Recording
     from .recordings.poses import PoseRecording
@@ -113,6 +112,9 @@ def diagnose(
         raise InputError("recordings is empty: there is nothing to diagnose")
     check_effects("forbid", forbid)
     check_positive("alpha", alpha, "the level of a test (0.05, say)", below=1.0)
+    check_callable("progress", progress, "progress(phase, share)")
+    if known is not None:
+        check_kind("known", known, Baseline, "fj.Baseline(rotor=True), say")
     check_positive("trust", trust, "relative one sigma")
     check_each("preprocess", [preprocess or Preprocess()], Preprocess, "Preprocess(cutoff=15), in Hz, say")
     postures = [one for one in recordings if isinstance(one, PoseRecording)]

@@ -13,6 +13,8 @@ import pytest
 
 import figaroh_jax as fj
 from figaroh_jax.errors import check_real
+from figaroh_jax.reporting.motion_view import show_motion
+from figaroh_jax.reporting.robot_view import show_diagnosis, show_run
 from figaroh_jax.rigid.dynamics import refuse_singular
 
 ROBOT = fj.load_urdf(fj.DEMO)
@@ -125,12 +127,19 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "milliseconds": (lambda: fj.recording(q=Q, tau=Q, time=4.0 * np.arange(300)), "stamps look like ms: add"),
     "dates": (lambda: ANY.recording(q=Q, tau=Q, time=TIME.astype("datetime64[s]")), "time holds dates; real"),
     "nan start": (lambda: fj.simulate(MODEL, Q, Q[0], np.full(4, np.nan), 0.01), "velocity holds nan; finite numbers"),
-    "nan torque": (lambda: fj.simulate(MODEL, Q * np.inf, Q[0], Q[0], 0.01), "command holds .*; finite numbers are"),
+    "nan torque": (lambda: fj.simulate(MODEL, np.where(Q > 0.4, np.nan, Q), Q[0], Q[0], 0.01), "command holds nan; f"),
     "no posture": (lambda: seen(q=Q[:0], position=Q[:0, :3]), "recording 'postures': q holds no posture"),
     "no quaternion": (
         lambda: fj.postures(q=Q, pose=np.zeros((300, 7)), base_frame="base", tool_frame="hand"),
         "pose, row 0 .from 0.: the quaternion is zero",
     ),
+    "baseline": (lambda: ANY.diagnose(ROBOT, [RUN], known="viscous"), "known is the text 'viscous'; a Baseline"),
+    "baseline of a fit": (lambda: ANY.identify(ROBOT, [RUN], known=True), "known is of type bool; a Baseline"),
+    "limits of links": (lambda: ANY.identify(ROBOT, [RUN], bounds="forearm"), "bounds is the text 'forearm'; a Map"),
+    "progress": (lambda: ANY.diagnose(ROBOT, [RUN], progress=True), r"progress is True; a function .*\(phase, share\)"),
+    "view of a design": (lambda: show_motion(ANY), "design is of type module; a Design"),
+    "view of a diagnosis": (lambda: show_diagnosis(ANY), "diagnosis is of type module; a Diag"),
+    "view of a run": (lambda: show_run("nowhere"), "nowhere: holds no run with a model"),
     "switch": (lambda: ANY.calibrate(ROBOT, [SEEN], priors="no"), "priors is the text 'no'; True or False is expected"),
     "check": (lambda: ANY.identify(ROBOT, [RUN], check="no"), "check is the text 'no'; True or False"),
     "kinematic": (lambda: ANY.load_urdf(fj.DEMO, kinematic=1), "kinematic is 1; True or False"),

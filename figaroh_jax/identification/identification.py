@@ -18,7 +18,17 @@ from jaxtyping import Bool, Float
 from ..effects.base import Effect
 from ..effects.friction import CoulombFriction
 from ..effects.plausibility import implausible
-from ..errors import InputError, check_each, check_names, check_one_of, check_positive, check_switch, nearest
+from ..errors import (
+    InputError,
+    check_callable,
+    check_each,
+    check_kind,
+    check_names,
+    check_one_of,
+    check_positive,
+    check_switch,
+    nearest,
+)
 from ..estimation.base_parameters import BaseParameters, base_parameters, essential
 from ..estimation.columns import friction_terms, structural_columns
 from ..estimation.conic import Body, NotConverged
@@ -183,6 +193,11 @@ def identify(
     check_one_of("fit", fit, get_args(Fit))
     check_positive("trust", trust, "relative one sigma")
     check_switch("check", check)
+    check_callable("progress", progress, "progress(phase, share)")
+    if known is not None:
+        check_kind("known", known, Baseline, "fj.Baseline(rotor=True), say")
+    if bounds is not None:
+        check_kind("bounds", bounds, Mapping, "{'forearm': {'mass': [1.0, 3.0]}}, in kg, say")
     if not len(recordings):
         raise InputError("recordings is empty: there is nothing to fit")
     backend = as_backend(model)

@@ -17,7 +17,7 @@ from zipfile import BadZipFile
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import InputError, check_switch
+from ..errors import InputError, check_kind, check_switch
 from ..excitation.clearance import Clearance, link_poses
 from ..excitation.design import Design
 from ..excitation.task import clearance_asked, excite_block
@@ -103,6 +103,7 @@ def show_motion(
     A slider stands for the time; with `play` the motion repeats. Raises `InputError` where viser is not installed, or
     the design has no such trajectory.
     """
+    check_kind("design", design, Design, "`excite` gives one")
     check_switch("play", play)
     if not 1 <= trajectory <= len(design.stages):
         raise InputError(f"trajectory {trajectory}: the design has {len(design.stages)}, counted from 1")

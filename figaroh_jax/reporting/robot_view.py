@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import InputError
+from ..errors import InputError, check_kind, check_path
 from ..formats.config import load_task
 from ..formats.export import load_model
 from ..formats.robotfile import load_robot, read_robot
@@ -99,13 +99,14 @@ def show_diagnosis(diagnosis: Diagnosis, port: int = 8080, *, magnify: float = 2
 
     Raises `InputError` where viser is not installed.
     """
+    check_kind("diagnosis", diagnosis, Diagnosis, "`diagnose` gives one")
     nominal = None if diagnosis.baseline is None else diagnosis.baseline.robot
     view = RobotView(diagnosis.model.robot, _said(_causes(diagnosis)), nominal)
     motions = {trace.name: (trace.time, trace.position) for trace in diagnosis.traces}
     return serve(view, motions, port, magnify)
 
 
-def show_run(folder: Path, port: int = 8080, *, magnify: float = 20.0) -> viser.ViserServer:
+def show_run(folder: str | Path, port: int = 8080, *, magnify: float = 20.0) -> viser.ViserServer:
     """Serve the robot of a finished run as `show_diagnosis` does; the nominal robot is that of the run's task.
 
     Raises `InputError` where viser is not installed, and for a folder that holds no run with a model.
@@ -113,9 +114,10 @@ def show_run(folder: Path, port: int = 8080, *, magnify: float = 20.0) -> viser.
     return serve(*view_of(folder), port, magnify)
 
 
-def view_of(folder: Path) -> tuple[RobotView, Motions]:
+def view_of(folder: str | Path) -> tuple[RobotView, Motions]:
     """The view of a run directory and the motions that its task's recordings hold, as far as they are still there."""
-
+    check_path("folder", folder)
+    folder = Path(folder)
     answer = next((folder / name for name in ("answer.json", "result.json") if (folder / name).is_file()), None)
     if answer is None or not (folder / "model").is_dir():
         raise InputError(f"{folder}: holds no run with a model (answer.json or result.json, and model/)")
