@@ -135,7 +135,7 @@ class SecondRipple(TorqueRipple):
     levels = ("torque",)
 
     def apart_from(self, other: Effect, low: Float[np.ndarray, " nv"], high: Float[np.ndarray, " nv"]) -> bool:
-        """Whether the motion covers half a beat of the two: closer orders are one wave that grows or fades."""
+        """Whether the motion covers half a beat of the two: waves of closer orders are one that grows or fades."""
         order = other.order if isinstance(other, TorqueRipple) else 0.0
         return bool(abs(float(self.order) - float(order)) * (high - low)[int(self.at[0])] > np.pi)
 

@@ -400,6 +400,8 @@ def _fall(diagnosis: Diagnosis) -> str:
 
 
 def _list(causes: Sequence[Cause]) -> str:
+    if len(causes) == 2 and causes[0].name == causes[1].name:
+        return f"{phrase(causes[0].name)} (twice)"
     shown = [_counted(cause) for cause in causes[: 2 if len(causes) == 2 else 1]]
     more = len(causes) - len(shown)
     if more:
