@@ -391,7 +391,14 @@ def test_a_users_loop_is_not_replaced(tmp_path: Path):
     (tmp_path / "loop.json").unlink()
     fj.write_loop(loop, tmp_path)
     fj.write_loop(loop, tmp_path)  # its own
+    fj.write_model(loop.robot, tmp_path)
+    fj.write_loop(loop, tmp_path)
     assert fj.read_loop(tmp_path).robot.dof_names == ("elbow",)
+    edited = (tmp_path / "loop.json").read_text().replace("{", "{ ", 1)
+    (tmp_path / "loop.json").write_text(edited)
+    with pytest.raises(InputError, match=r"loop\.json was changed after write_loop wrote it"):
+        fj.write_loop(fj.load_loop(fj.DEMO, {"wrist": {"kind": "torque"}}, joints=["wrist"])[0], tmp_path)
+    assert (tmp_path / "loop.json").read_text() == edited
 
 
 def test_a_users_file_is_not_replaced(tmp_path: Path):
@@ -403,3 +410,13 @@ def test_a_users_file_is_not_replaced(tmp_path: Path):
     assert own.read_text() == "mine" and list(tmp_path.iterdir()) == [own]
     write_model(model, tmp_path / "new")
     write_model(extend(model), tmp_path / "new")  # what it has written it may write anew
+    for name in ("robot.urdf", "robot.xml", "effects.yaml"):
+        folder = tmp_path / name.replace(".", "_")
+        write_model(model, folder)
+        before = (folder / name).read_text()
+        edited = before.replace("demo_arm", "my_arm", 1)
+        assert edited != before
+        (folder / name).write_text(edited)
+        with pytest.raises(InputError, match=rf"{name} was changed after write_model wrote it"):
+            write_model(model, folder)
+        assert (folder / name).read_text() == edited

@@ -8,6 +8,8 @@ a warning for all that a robot file could not say.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -30,8 +32,9 @@ from .taskfile import read_yaml
 from .urdf import load_urdf
 from .urdf_text import urdf_text
 
-__all__ = ["dump_yaml", "load_model", "model_files", "write_model"]
+__all__ = ["dump_yaml", "load_model", "mark_written", "model_files", "refuse_others", "write_model"]
 
+_LAST = b"# as written: "
 _HEAD = "# The extended model: the robot before its effects, and every effect. Read by figaroh-jax.\n"
 
 _GEOMETRY = ("placement", "axis", "ratio", "offset", "frame_placement")
@@ -58,7 +61,7 @@ def dump_yaml(content: Mapping[str, Any], *, line: bool = False) -> str:
 def write_model(model: ExtendedModel | RobotModel, directory: str | Path, causes: Sequence[Cause] = ()) -> None:
     """Write `robot.urdf`, `robot.xml` and `effects.yaml` into `directory`, which is made where it is missing.
 
-    Files of these names that it has not written are not replaced: `InputError`.
+    Files of these names that it has not written, or that were changed since, are not replaced: `InputError`.
 
     `causes` give the standard deviations of the effects that they name; those of the others are null. What a format
     cannot carry stands in `effects.yaml`, at the effect and under `warnings`.
@@ -77,18 +80,55 @@ def write_model(model: ExtendedModel | RobotModel, directory: str | Path, causes
 
 def _write(texts: Mapping[str, str], directory: Path) -> None:
     """Write files of a model by their names; `InputError` where others of these names are there, or nothing can be."""
-    head = directory / "effects.yaml"
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        if not (head.is_file() and head.read_bytes().startswith(_HEAD.encode())):
-            for name, text in texts.items():
-                file = directory / name
-                if file.exists() and not (file.is_file() and file.read_bytes() == text.encode()):
-                    raise InputError(f"{file} is there and is none that write_model wrote; name another folder")
+        for name, text in texts.items():
+            refuse_others(directory / name, text)
+        before = _written(directory / "effects.yaml")  # of a loop too
         for name, text in texts.items():
             (directory / name).write_text(text, encoding="utf-8")
+        mark_written(*(directory / name for name in texts), before=before)
     except OSError as error:
         raise InputError(f"{directory}: cannot be written: {error.strerror}; name another folder") from error
+
+
+def refuse_others(file: Path, text: str, writer: str = "write_model") -> None:
+    """Raise `InputError` where a file of a model's folder is there that was not written so, or changed since.
+
+    One that holds the `text` already may be written again.
+    """
+    if not file.exists() or (file.is_file() and file.read_bytes() == text.encode()):
+        return
+    known = _written(file.with_name("effects.yaml"))
+    if file.name not in known:
+        raise InputError(f"{file} is there and is none that {writer} wrote; name another folder")
+    if not (file.is_file() and _digest(file.read_bytes()) == known[file.name]):
+        raise InputError(f"{file} was changed after {writer} wrote it; name another folder")
+
+
+def mark_written(*files: Path, before: Mapping[str, str] | None = None) -> None:
+    """Note in the `effects.yaml` of a model's folder what its files hold, once they were written.
+
+    `before` are the notes of an `effects.yaml` that stood there, of files that this one does not know.
+    """
+    head = files[0].with_name("effects.yaml")
+    known = {**(before or {}), **_written(head)} | {file.name: _digest(file.read_bytes()) for file in files}
+    head.write_bytes(head.read_bytes().partition(_LAST)[0] + _last(known))
+
+
+def _last(digests: Mapping[str, str]) -> bytes:
+    return _LAST + ", ".join(f"{name} {digest}" for name, digest in digests.items()).encode() + b"\n"
+
+
+def _written(file: Path) -> dict[str, str]:
+    """Digests of the files of a model by their names, as they were written; empty where `file` tells of none."""
+    last = file.read_bytes().partition(_LAST)[2] if file.is_file() else b""
+    return dict(re.findall(r"(\S+) ([0-9a-f]{16})", last.decode(errors="replace")))
+
+
+def _digest(content: bytes) -> str:
+    """Of a file's content, without the line that tells the digests."""
+    return hashlib.sha256(content.partition(_LAST)[0]).hexdigest()[:16]
 
 
 def model_files(extended: ExtendedModel, causes: Sequence[Cause] = ()) -> dict[str, str]:

@@ -389,8 +389,8 @@ def _written_twice(look: Look) -> Iterator[Finding]:
         yield Finding(
             False,
             f"position and torque of every joint in row {look.row(rows[0])} (from 0){and_more(rows)} are those of the"
-            " row before, and the motion goes on as if that row were not there: what is written twice makes all that"
-            " follows late; delete these rows",
+            " row before, and the motion goes on as if that row were not there: a reading that was written twice."
+            " Delete these rows; where no stamps say the time, they make all that follows late",
         )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from ..effects.base import Effect, place
 from ..effects.registry import find
 from ..errors import InputError, check_kind, check_path
-from ..formats.export import load_model, model_files, write_model
+from ..formats.export import load_model, mark_written, model_files, refuse_others, write_model
 from ..rigid.manifold import neutral
 from ..rigid.model import RobotModel
 from .causes import motor_of, rigid, with_motor
@@ -41,19 +41,9 @@ def write_loop(loop: Loop, directory: str | Path) -> None:
     """
     check_kind("loop", loop, Loop, "`load_loop` makes one; write_loop(loop, directory)")
     check_path("directory", directory)
-    file = Path(directory) / LOOP
-    if file.exists() and not _written(file):
-        raise InputError(f"{file} is there and is none that write_loop wrote; name another folder")
+    refuse_others(Path(directory) / LOOP, described_text(loop), "write_loop")
     write_model(extended_of(rigid(loop)), directory)
     add_loop(Path(directory), loop)
-
-
-def _written(file: Path) -> bool:
-    """Whether a file is a `loop.json` of this library."""
-    try:
-        return {"dt", "integrator"} <= set(json.loads(file.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
-        return False
 
 
 def add_loop(folder: Path, loop: Loop) -> None:
@@ -66,6 +56,7 @@ def add_loop(folder: Path, loop: Loop) -> None:
     if motor_of(loop.robot) is not None:
         mjcf.write_text(model_files(extended_of(loop))[mjcf.name], encoding="utf-8")
     mjcf.write_text(with_drives(mjcf, described(loop)), encoding="utf-8")
+    mark_written(mjcf, folder / LOOP)
 
 
 def read_loop(folder: str | Path) -> Loop:
