@@ -155,25 +155,25 @@ def test_torques_limb_by_limb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         scalar_forms._limbs.cache_clear()
 
 
-def test_accesses_of_a_long_kernel_share_no_constant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("samples", [pytest.param(32, marks=pytest.mark.slow), 33])
+def test_accesses_of_a_long_kernel_share_no_constant(samples: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """From a constant Triton's compiler reaches whatever uses the same, for each access anew (minutes for TALOS)."""
     monkeypatch.setattr(kernels, "FEW", 0)
     model, torques = robots.load(robots.TREE, tmp_path), FORMS["torques"]
     shape, columns, constants = torques.shape(model), torques.columns(model), torques.constants(model)
     (program,) = torques.programs(model, torques.known(model))
-    for samples in (33,):
-        arrays = [jnp.asarray(x) for x in states(model, samples)]
+    arrays = [jnp.asarray(x) for x in states(model, samples)]
 
-        def kernel(*arrays: Any) -> Any:
-            return launch(program, constants, arrays, shape, columns, torques.last, interpret=True)
+    def kernel(*arrays: Any) -> Any:
+        return launch(program, constants, arrays, shape, columns, torques.last, interpret=True)
 
-        (call,) = (e for e in jax.make_jaxpr(kernel)(*arrays).jaxpr.eqns if e.primitive.name == "pallas_call")
-        loops = [e.params["body_jaxpr"].jaxpr for e in call.params["jaxpr"].eqns if e.primitive.name == "while"]
-        assert len(loops) > model.nv
-        for loop in loops:
-            for step in (e for e in loop.eqns if e.primitive.name not in ("masked_load", "masked_swap")):
-                assert not any(isinstance(x, Literal) for x in step.invars) or step.primitive.name == "neg", step
-        agree(kernel(*arrays), plainly(torques, model, *arrays))
+    (call,) = (e for e in jax.make_jaxpr(kernel)(*arrays).jaxpr.eqns if e.primitive.name == "pallas_call")
+    loops = [e.params["body_jaxpr"].jaxpr for e in call.params["jaxpr"].eqns if e.primitive.name == "while"]
+    assert len(loops) > model.nv
+    for loop in loops:
+        for step in (e for e in loop.eqns if e.primitive.name not in ("masked_load", "masked_swap")):
+            assert not any(isinstance(x, Literal) for x in step.invars) or step.primitive.name == "neg", step
+    agree(kernel(*arrays), plainly(torques, model, *arrays))
 
 
 @pytest.mark.parametrize("name", TREES)

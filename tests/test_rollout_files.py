@@ -237,7 +237,7 @@ def test_identify_says_that_free_gains_are_not_fitted_unless_named(tmp_path: Pat
     ("drive", "words"),
     [
         ({"kind": "postion", "kp": 1.0}, "actuator.yaw.kind: Input should be 'position', 'velocity' or 'torque'"),
-        ({"kp": "stiff"}, "actuator.yaw.kp: Input should be a valid number"),
+        ({"kp": "stiff"}, "actuator.yaw.kp: expected a number, not the text 'stiff'"),
         ({"kP": 3.0}, "unknown key 'kP'; did you mean 'kp'?"),
         ({"kind": "velocity", "kp": 3.0}, "kind velocity needs kd"),
         ({"kind": "torque", "kp": 3.0}, "kind torque has no kp"),

@@ -112,6 +112,8 @@ def mark_written(*files: Path, before: Mapping[str, str] | None = None) -> None:
     `before` are the notes of an `effects.yaml` that stood there, of files that this one does not know.
     """
     head = files[0].with_name("effects.yaml")
+    if not head.is_file():
+        return
     known = {**(before or {}), **_written(head)} | {file.name: _digest(file.read_bytes()) for file in files}
     head.write_bytes(head.read_bytes().partition(_LAST)[0] + _last(known))
 
