@@ -420,3 +420,6 @@ def test_a_users_file_is_not_replaced(tmp_path: Path):
         with pytest.raises(InputError, match=rf"{name} was changed after write_model wrote it"):
             write_model(model, folder)
         assert (folder / name).read_text() == edited
+        (folder / name).write_text(before + "# mine\n")  # behind all that was written
+        with pytest.raises(InputError, match=rf"{name} was changed after write_model wrote it"):
+            write_model(model, folder)

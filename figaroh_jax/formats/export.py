@@ -124,13 +124,14 @@ def _last(digests: Mapping[str, str]) -> bytes:
 
 def _written(file: Path) -> dict[str, str]:
     """Digests of the files of a model by their names, as they were written; empty where `file` tells of none."""
-    last = file.read_bytes().partition(_LAST)[2] if file.is_file() else b""
+    last = file.read_bytes().partition(_LAST)[2].partition(b"\n")[0] if file.is_file() else b""
     return dict(re.findall(r"(\S+) ([0-9a-f]{16})", last.decode(errors="replace")))
 
 
 def _digest(content: bytes) -> str:
     """Of a file's content, without the line that tells the digests."""
-    return hashlib.sha256(content.partition(_LAST)[0]).hexdigest()[:16]
+    before, _, after = content.partition(_LAST)
+    return hashlib.sha256(before + after.partition(b"\n")[2]).hexdigest()[:16]
 
 
 def model_files(extended: ExtendedModel, causes: Sequence[Cause] = ()) -> dict[str, str]:
