@@ -6,6 +6,7 @@
     python benchmarks/hidden_effects.py --trusted --clean 12                 # links that the task trusts to 2 %
     python benchmarks/hidden_effects.py --foreign --size 0.08                # laws that no catalogue holds
     python benchmarks/hidden_effects.py --closed-loop --robots ur10e         # MuJoCo C in place of inverse dynamics
+    python benchmarks/hidden_effects.py --several 5 --cases 20               # five at once, as in a real robot
 
 The recordings come from Pinocchio or MuJoCo C (`tests/generators`), which share no code with the library.
 """
@@ -26,8 +27,17 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import numpy as np  # noqa: E402
-from generators import CLASSES, CLOSED_LOOP_EFFECTS, EFFECTS, FOREIGN, Case, make_case, make_closed_loop_case  # noqa: E402
-from generators.scoring import Score, judge, table, upper_bound  # noqa: E402
+from generators import (  # noqa: E402
+    CLASSES,
+    CLOSED_LOOP_EFFECTS,
+    EFFECTS,
+    FOREIGN,
+    Case,
+    make_case,
+    make_closed_loop_case,
+    observable,
+)
+from generators.scoring import Score, judge, named, table, upper_bound  # noqa: E402
 from generators.sensors import COLOURS  # noqa: E402
 
 LAYOUTS = {"repeats": (2, 3), "single": (1, 6)}
@@ -42,17 +52,22 @@ def main() -> None:
     jax.config.update("jax_compilation_cache_dir", str(ROOT / ".cache" / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    scores, seconds, p_values = [], [], []
+    scores, seconds, p_values, found = [], [], [], np.zeros(3, dtype=int)
     for label, case, forbid in _cases(args):
         start = time.process_time()
         answer = _diagnose(case, forbid)
         seconds.append(time.process_time() - start)
         scores.append(judge(label, () if forbid or args.foreign else case.truth, answer))
         p_values.append(answer.p_value)
+        if args.several:
+            found += np.array(_each(case, answer))
         print(f"{table(scores[-1:]).splitlines()[0]}  p {p_values[-1]:.4f}  {seconds[-1]:.1f} CPU s", flush=True)
     print(table(scores).splitlines()[-1])
     print(f"CPU s a case: first {seconds[0]:.1f}, median {sorted(seconds)[len(seconds) // 2]:.1f}")
     _rates(scores)
+    if args.several:
+        right, alike, hidden = found
+        print(f"of {hidden} hidden effects {right} named at their place, {alike} more in a set")
     if args.clean:
         _uniformity(dict(zip((score.case for score in scores), p_values, strict=True)))
 
@@ -74,6 +89,16 @@ def _uniformity(p: dict[str, float]) -> None:
         print(f"p of {len(own)} clean cases, {title}: {shares}; chance of so many small (one-sided KS) {too_small:.3f}")
 
 
+def _each(case: Case, answer: Any) -> tuple[int, int, int]:
+    """How many of a case's effects are a cause's name, how many only one of a cause's set, and how many there are."""
+    causes = named(answer)
+    right = [any(name in observable(t) for name, _ in causes) for t in case.truth]
+    alike = [any(members & observable(t) for _, members in causes) for t in case.truth]
+    for truth, own, one in zip(case.truth, right, alike, strict=True):
+        print(f"    {'named' if own else 'set' if one else 'missed':7} {truth.effect} ({', '.join(truth.at)})")
+    return sum(right), sum(alike) - sum(right), len(right)
+
+
 def _rates(scores: list[Score]) -> None:
     wrong = sum(bool(s.false) for s in scores)
     print(f"cases with a false name: {wrong} of {len(scores)} (95 % bound {upper_bound(wrong, len(scores)):.3f})")
@@ -92,6 +117,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--left-out", action="store_true", help="forbid the hidden effect: `unknown` is right")
     parser.add_argument("--foreign", action="store_true", help="hide laws that stand in no catalogue")
     parser.add_argument("--closed-loop", action="store_true", help="MuJoCo C in place of inverse dynamics")
+    parser.add_argument("--several", type=int, default=0, metavar="K", help="K effects of 2 to 15 %% at once")
+    parser.add_argument("--cases", type=int, default=12, help="of several effects (default 12)")
     return parser.parse_args()
 
 
@@ -109,6 +136,22 @@ def _cases(args: argparse.Namespace) -> Iterator[tuple[str, Case, tuple[str, ...
     if args.clean:
         return
     known = CLOSED_LOOP_EFFECTS if args.closed_loop else EFFECTS
+    for number in range(args.cases if args.several else 0):
+        layout = args.layouts[number % len(args.layouts)]
+        robot, seed = args.robots[number // 2 % len(args.robots)], args.seeds[0] + number
+        rng = np.random.default_rng([seed, 7])
+        effects = rng.choice(args.effects or known, args.several, replace=False)
+        sizes = np.exp(rng.uniform(np.log(0.02), np.log(0.15), args.several))
+        try:
+            wanted = [(str(effect), float(size)) for effect, size in zip(effects, sizes, strict=True)]
+            case = _made(make, wanted, robot, layout, seed, noise=args.noise)
+        except ValueError as error:
+            print(error)
+            continue
+        told = ", ".join(f"{t.effect} {size:.2f}" for t, size in zip(case.truth, sizes, strict=True))
+        yield f"{robot} {layout} seed {seed}: {told}", case, ()
+    if args.several:
+        return
     for effect in args.effects or (FOREIGN if args.foreign else known):
         for robot in args.robots:
             for layout in args.layouts:

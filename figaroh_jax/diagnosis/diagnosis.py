@@ -180,14 +180,14 @@ def _searched(
     progress: Callable[[str, float], None],
     generator: np.random.Generator,
 ) -> Searched:
-    """The causes that the data show; where a rest stays, without the laws of one joint that any rest looks like.
+    """The causes that the data show; where a rest stays, without the laws of a joint or link that any rest looks like.
 
     Beside a rest those (`Effect.beside_rest`) are not named, and take the place of causes that could be: the search is
     taken up again from where the first of them came in; or from all the others that were found, where that surely
     predicts better. Such an effect of the whole robot stays: what it stands for would go into several others, each of
     which would look sure. One that fades stays where recordings kept out, in which it is no longer there, surely show
     it: what any rest looks like would be there again. Where many causes are found, that is known before they are in one
-    fit.
+    fit. Many that leave nothing are the answer where the others alone leave a rest, or surely predict worse.
     """
 
     def ended(before: Setting, search: Search) -> Searched:
@@ -207,7 +207,8 @@ def _searched(
             here = here._replace(spectrum=noise)
         return Searched(before, here, search, found, joint, left, strict, gone)
 
-    like_a_rest = [n for n, e in CATALOGUE.items() if not e.beside_rest and e.acts_on in ("joint", "pair")]
+    of_one = [n for n, e in CATALOGUE.items() if e.acts_on in ("joint", "pair") or e.inertial]
+    like_a_rest = [name for name in of_one if not CATALOGUE[name].beside_rest]
 
     def first_of(found: list[Found]) -> int | None:
         return next((k for k, f in enumerate(found) if f.effect.name in like_a_rest), None)
@@ -215,13 +216,14 @@ def _searched(
     def too_many(found: list[Found]) -> bool:
         return len(found) > FOR_SURE * FEW_CAUSES and first_of(found) is not None
 
-    search = find_causes(*here[:4], forbid, alpha, progress, generator, enough=too_many)
+    search, first = find_causes(*here[:4], forbid, alpha, progress, generator, enough=too_many), None
     taken = first_of(search.found)
     if taken is None or not too_many(search.found):
         first = ended(here, search)
         if taken is None or not first.strict:
             return first
-        del first  # its rows and columns are large
+        if not first.all_told:
+            first = None  # its rows and columns are large
     kept = search.found[:taken]
     fading = [f for f in search.found[taken:] if f.effect.fades and _borne_out(here, kept, f)]
     left_out = [f for f in search.found[taken:] if f.effect.name in like_a_rest and f not in fading]
@@ -240,6 +242,8 @@ def _searched(
         del other
     give_back_holes()
     last = ended(here, search)
+    if first and (not last.all_told or t_value(last.search.blocks, first.search.blocks) > T_BETTER):
+        return first
     gone = (*last.gone, *(Nearest(f.name, f.share, LIKE_A_REST) for f in left_out))
     return last._replace(gone=gone, fading=tuple(f.name for f in fading))
 

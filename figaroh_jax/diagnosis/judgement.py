@@ -30,7 +30,7 @@ from .search import Found, Search, chance_beside
 from .setting import Setting
 from .standstill import left_weighed, only_sticks, resting
 from .step import stand
-from .thresholds import ALL_BUT, REST_P, SURE_DROP
+from .thresholds import ALL_BUT, NO_REST, REST_P, SURE_DROP
 
 __all__ = [
     "KeptOut",
@@ -71,6 +71,11 @@ class Searched(NamedTuple):
     strict: bool  # whether a rest stays, beside which a cause must show more to be named
     gone: tuple[Nearest, ...] = ()  # causes that came in and went before they were judged
     fading: tuple[Name, ...] = ()  # causes that were there and are gone in recordings kept out
+
+    @property
+    def all_told(self) -> bool:
+        """Whether nothing is left beside what was found, however much that is."""
+        return not self.left.rest.there and self.left.excess <= NO_REST
 
 
 class KeptOut:
@@ -135,29 +140,46 @@ def reasons_against(
     searched: Searched, each: Sequence[Standing], kept_out: KeptOut, doubted: bool, tolerance: float
 ) -> dict[Name, str]:
     """Why each cause that was found is not named; empty where it is."""
-    here, found, joint, strict = searched.here, searched.found, searched.joint, searched.strict
+    here, found, joint = searched.here, searched.found, searched.joint
     noise = noise_rms(here.problem, here.spectrum)
     beyond = relative_rest(here.problem, joint.step.state, noise)
-    if found and doubted and float(beyond.max()) > tolerance:  # a rest of the answer is one for its names
-        strict = strict or not sticks_alone(here, joint, tolerance)
+    doubt = bool(found) and doubted and float(beyond.max()) > tolerance and not sticks_alone(here, joint, tolerance)
     weighed = left_weighed(here.problem, joint.step.state, noise)  # rows at reversals say nothing of a law
-    rests = beside_rest(each, [f.joints for f in found], strict, np.minimum(beyond, weighed), tolerance)
-    if not all(rests):  # what passed for noise at a cause's joints may be what it stands in for
+
+    def beside(rest: bool) -> list[bool]:
+        return beside_rest(each, [f.joints for f in found], rest, np.minimum(beyond, weighed), tolerance)
+
+    # a rest of the answer is one for its names; where more than a few are found, each is asked as if there were one
+    rests, left = beside(searched.strict or doubt), beside(not searched.all_told or doubt)
+    if not all(left):  # what passed for noise at a cause's joints may be what it stands in for
         # what any rest looks like may stand in for something at another joint, too
         places = [list(f.joints) if f.effect.beside_rest else list(range(here.problem.model.nv)) for f in found]
         at, moving = sorted({j for own in places for j in own}), ~np.any(resting(here.problem), axis=2)
         rough = roughly_predictable(here.problem, joint.step, here.whitening, tolerance, moving, at)
-        rests = [rest or bool(rough[own].any()) for rest, own in zip(rests, places, strict=True)]
-    asked = (tolerance, kept_out.certain, searched.fading)
-    pairs = list(zip(each, rests, strict=True))
+        rests, left = (
+            [rest or bool(rough[own].any()) for rest, own in zip(r, places, strict=True)] for r in (rests, left)
+        )
 
-    def reason(one: Standing, rest: bool, elsewhere: bool = False) -> str:
-        return reason_against(one, rest, *asked, kept_out=kept_out.gain, elsewhere=elsewhere)
+    def refused(each: Sequence[Standing]) -> dict[Name, str]:
+        asked, pairs = (tolerance, kept_out.certain, searched.fading), list(zip(each, rests, strict=True))
 
-    against = {one.name: reason(one, rest) for one, rest in pairs}
-    alike = elsewhere_too(found, against, here.problem.model.nv)
-    against |= {one.name: reason(one, rest, True) for one, rest in pairs if one.name in alike}
-    return against | behind_joints([one for one, rest in pairs if rest], against)
+        def reason(one: Standing, rest: bool, elsewhere: bool = False) -> str:
+            return reason_against(one, rest, *asked, kept_out=kept_out.gain, elsewhere=elsewhere)
+
+        against = {one.name: reason(one, rest) for one, rest in pairs}
+        alike = elsewhere_too(found, against, here.problem.model.nv)
+        against |= {one.name: reason(one, rest, True) for one, rest in pairs if one.name in alike}
+        return against | behind_joints([one for one, rest in pairs if rest], against)
+
+    freed = [
+        replace(o, beside_rest=True) if many and not rest else o
+        for o, many, rest in zip(each, rests, left, strict=True)
+    ]
+    if freed != list(each):  # many that leave nothing: where each is named that counts, none is a part of a rest
+        against = refused(freed)
+        if not any(against[one.name] and one.share >= tolerance for one in each):
+            return against
+    return refused(each)
 
 
 def as_slow_noise(

@@ -47,6 +47,7 @@ class LinkInertia(LinkEffect):
     contains = ("payload",)
     indistinguishable_from = ("payload",)
     needs_trust = 0.05  # ten free parameters of a link make up for many a misfit
+    beside_rest = False  # for the same reason: wrong links were named where several other effects had no name
     equation = "W_k dpi_k, dpi_k free"
     separated_by = "the same motion with {at} disconnected or weighed"
     in_rollouts = InRollouts(
