@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from generators import CLOSED_LOOP_EFFECTS, Case, available, make_case, make_closed_loop_case
+from generators import CLOSED_LOOP_EFFECTS, Case, available, make_case, make_closed_loop_case, observable
 from generators.scoring import Score, judge, named, table
 
 from figaroh_jax.formats import config
@@ -187,6 +187,52 @@ def test_a_case_drawn_at_run_time_gets_no_wrong_name(robots: tuple[str, ...], la
     effect, robot = rng.choice(HIDDEN), rng.choice(robots)
     score = hidden_effect(str(effect), str(robot), layout, seed)
     assert score.grade != "wrong", f"seed {seed} ({effect} on {robot}):\n{table([score])}"
+
+
+@needs_robots
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_of_several_effects_at_once_most_are_named_and_nothing_else(robot: str):
+    """As in a real robot: four laws of its joints, drawn at run time, in one recording."""
+    seed = int.from_bytes(os.urandom(4), "little")
+    laws = [name for name in HIDDEN if name not in ("payload", "torque_delay", "power_law_friction")]
+    chosen = np.random.default_rng(seed).choice(laws, 4, replace=False)
+    case = make_case([(str(name), 0.08) for name in chosen], robot, *WITH_REPEATS, seed=seed)
+    answer = diagnosis_of(case)
+    causes = named(answer)
+    told = f"seed {seed}: {chosen}\n{table([judge(robot, case.truth, answer)])}"
+    assert all(members & set().union(*map(observable, case.truth)) for _, members in causes), told
+    assert sum(any(members & observable(t) for _, members in causes) for t in case.truth) >= 2, told
+
+
+@needs_robots
+@pytest.mark.slow
+def test_a_payload_among_other_effects_is_at_its_link():
+    """Found first, where all others are still in what it is to explain, it fits the link before best."""
+    hidden = {
+        "asymmetric_coulomb_friction": 0.077,
+        "payload": 0.143,
+        "friction_drift": 0.104,
+        "coupled_transmission": 0.023,
+    }
+    case = make_case(list(hidden.items()), "panda", *WITH_REPEATS, seed=71002)
+    answer = diagnosis_of(case)
+    payload = next(t for t in case.truth if t.effect == "payload")
+    places = [members for name, members in named(answer) if name[0] in ("payload", "link_inertia")]
+    assert len(places) == 1 and places[0] & observable(payload), table([judge("panda", case.truth, answer)])
+    assert not judge("panda", case.truth, answer).false
+
+
+@needs_robots
+@pytest.mark.slow
+def test_a_link_does_not_stand_in_for_what_has_no_name():
+    """Links trusted to 2 %, several effects of which some stay unnamed: a link's ten numbers follow what they leave."""
+    effects = [("stribeck_friction", 0.105, ("joint_2",)), ("joint_elasticity", 0.075, ("joint_2",)),
+               ("payload", 0.024, ("link_5",)), ("coupled_transmission", 0.108, ("joint_3", "joint_4")),
+               ("gravity_tilt", 0.056, ()), ("asymmetric_coulomb_friction", 0.072, ("joint_6",))]  # fmt: skip
+    case = make_case(effects, "tx40", *WITH_REPEATS, seed=60000)
+    score = judge("tx40", case.truth, diagnosis_of(case))
+    assert not score.false and len(score.told) >= 3, table([score])
 
 
 def test_demo_files_are_small():

@@ -65,7 +65,18 @@ from .rest import (
     wrong_law,
 )
 from .screening import OneMore, noise_squares
-from .search import Begun, Found, Rival, Search, chance_beside, eliminate, find_causes, judged_without, taken_beside
+from .search import (
+    Begun,
+    Found,
+    Rival,
+    Search,
+    at_their_links,
+    chance_beside,
+    eliminate,
+    find_causes,
+    judged_without,
+    taken_beside,
+)
 from .setting import Setting, prepared_signals, setting_beside, setting_of
 from .standstill import left_moving, resting
 from .step import Step, stand, with_causes
@@ -273,6 +284,7 @@ def _fitted_together(
     problem, start, whitening = here.problem, here.start, here.whitening
     found, bodies = rotors_for_bodies(problem, start, found, whitening, forbid)
     found, needless = eliminate(problem, start, found, whitening)
+    found = at_their_links(problem, start, found, whitening)
     gone = [*bodies, *(Nearest(one.name, share, _NEEDLESS) for one, share in needless)]
     joint = together(here, found)
     kept = _simple(here, found, joint, forbid, tolerance)

@@ -16,7 +16,7 @@ from .state import State
 from .step import Step
 from .thresholds import GAIN, OVERLAP_SAME, SIZE_REGION, T_ALIKE, T_APART, T_BETTER
 
-__all__ = ["ambiguous", "apart", "exists", "gains", "holds", "passes", "physical_sign", "rivals", "simpler"]
+__all__ = ["ambiguous", "apart", "exists", "gains", "holds", "member", "passes", "physical_sign", "rivals", "simpler"]
 
 
 def exists(problem: Problem, effect: Effect) -> bool:
@@ -108,7 +108,7 @@ def simpler(step: Step, contenders: list[Contender], one: Contender) -> list[Con
     kind = type(one.effect)
     inside = [c for c in contenders if c.name.effect in kind.contains and c.name.at == one.name.at]
     like = [c for c in rivals(step, contenders, one) if c.name.effect in kind.resembles and physical_sign(c.effect)]
-    return [c for c in (*inside, *like) if _member(step, one, c)]
+    return [c for c in (*inside, *like) if member(step, one, c)]
 
 
 def holds(law: Contender, one: Contender) -> bool:
@@ -122,7 +122,7 @@ def rivals(step: Step, contenders: list[Contender], one: Contender) -> list[Cont
     return [c for c in others if overlap(step.verdicts, one.verdicts, c.verdicts) > OVERLAP_SAME]
 
 
-def _member(step: Step, best: Contender, other: Contender) -> bool:
+def member(step: Step, best: Contender, other: Contender) -> bool:
     """Whether the data cannot tell the other from the best: held-out blocks and penalised squares alike.
 
     Of two that resemble each other, one has more numbers to follow a misfit with: squares alone do not tell them apart.
@@ -153,7 +153,7 @@ def _needed(best: Contender, inside: Contender) -> bool:
 
 def ambiguous(step: Step, best: Contender, rivals: list[Contender], screened: Screen) -> tuple[Name, ...]:
     """What cannot be told from the best: rivals that predict as well, and effects that are the same while moving."""
-    names = [c.name for c in rivals if _member(step, best, c)]
+    names = [c.name for c in rivals if member(step, best, c)]
     clearly_worse = {c.name for c in rivals if t_value(c.verdicts.blocks, best.verdicts.blocks) > T_APART}
     known = {group.name for group in screened.groups}
     same = [Name(effect, best.name.at) for effect in related(best.name.effect, "indistinguishable_from")]

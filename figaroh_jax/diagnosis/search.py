@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..compiled.memory import give_back_holes
-from ..effects.base import Effect, exact
+from ..effects.base import Effect, exact, place
 from ..estimation.noise import Spectrum
 from ..estimation.rows import Prior
 from ..results import Name
@@ -21,11 +21,11 @@ from .design import kind
 from .estimates import amplitude_places, with_amplitudes
 from .evidence import block_scores
 from .flexible import friction_width
-from .gates import ambiguous, apart, exists, gains, holds, passes, physical_sign, rivals, simpler
+from .gates import ambiguous, apart, exists, gains, holds, member, passes, physical_sign, rivals, simpler
 from .joint import polished
 from .problem import Problem
-from .screening import DRAWS, Null, Screen, Shown, catalogue, family_p, place_p, screen
-from .state import State, solved, with_width
+from .screening import DRAWS, Group, Null, Screen, Shown, catalogue, exact_columns, family_p, place_p, screen
+from .state import State, batched, solved, with_width
 from .step import Step, stand, with_cause, with_causes
 from .thresholds import (
     GAIN,
@@ -44,6 +44,7 @@ __all__ = [
     "Found",
     "Rival",
     "Search",
+    "at_their_links",
     "chance_beside",
     "eliminate",
     "find_causes",
@@ -414,6 +415,47 @@ def eliminate(
     del full
     give_back_holes()
     return found, gone
+
+
+def at_their_links(
+    problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]
+) -> list[Found]:
+    """The causes, each change of a link's inertia at the next link where it fits and predicts better; and with the next
+    link among what cannot be told from it where that does as well.
+
+    One that came in before others was judged beside all that they explain, which may hide at which of two links it is.
+    """
+    for one in [f for f in found if f.effect.inertial]:
+        step = stood_without(problem, start, found, one, whitening)
+        here, *others = _at_links(problem, step, one, whitening)
+        free = [c for c in others if c.name not in [f.name for f in found] and exists(problem, c.effect)]
+        better = [
+            c for c in free if c.verdicts.cost < here.verdicts.cost and c.verdicts.heldout < here.verdicts.heldout
+        ]
+        best = min(better, key=lambda c: c.verdicts.heldout, default=here)
+        alike = [c for c in (here, *free) if c is not best and member(step, best, c)]
+        if best is not here:
+            same = [Name(name.effect, best.name.at) for name in one.ambiguous if name.at == one.name.at]
+            told = one.as_another(Rival(best.name, best.effect, best.joints), [*(c.name for c in alike), *same])
+        else:
+            new = [c for c in alike if c.name not in one.ambiguous]
+            instead = (*one.instead, *(Rival(c.name, c.effect, c.joints) for c in new))
+            told = replace(one, ambiguous=(*one.ambiguous, *(c.name for c in new)), instead=instead)
+        found = [told if f is one else f for f in found]
+    return found
+
+
+def _at_links(problem: Problem, step: Step, one: Found, whitening: Float[np.ndarray, "F nv"]) -> list[Contender]:
+    """A change of a link's inertia at its link, and at those that a joint connects to it."""
+    joints, own = problem.model.joints, int(np.ravel(one.effect.at)[0])
+    base = ground(step.verdicts, step.state.prior, step.folded)
+    ready, out = for_refit(problem, step, base, whitening), []
+    for link in [own, *(k for k, joint in enumerate(joints) if k == joints[own].parent or joint.parent == own)]:
+        name = Name(one.name.effect, (problem.model.link_names[link],))
+        effect = place(type(one.effect), problem.model, name.at)
+        group = Group(name, batched(effect), exact_columns(problem, step.state, step.rows, whitening, effect))
+        out.append(contend(problem, step, whitening, base, ready, group, np.zeros(1, int), {}))
+    return out
 
 
 def _all_in(problem: Problem, start: State, found: list[Found], whitening: Float[np.ndarray, "F nv"]) -> Step:
