@@ -235,6 +235,18 @@ def test_a_link_does_not_stand_in_for_what_has_no_name():
     assert not score.false and len(score.told) >= 3, table([score])
 
 
+@needs_robots
+@pytest.mark.slow
+def test_a_body_that_more_than_a_few_causes_come_with_is_named_and_nothing_is_left():
+    """The search without changes of links' inertia puts the body one link before its own, which leaves a rest."""
+    hidden = {"torque_offset": 0.146, "payload": 0.118, "joint_spring": 0.038, "position_dependent_friction": 0.126}
+    case = make_case(list(hidden.items()), "tx40", *WITH_REPEATS, seed=59012)
+    answer = diagnosis_of(case)
+    score = judge("tx40", case.truth, answer)
+    assert answer.verdict == "named" and not score.false, table([score])
+    assert {"payload", "link_inertia"} & {name for name, _ in score.told}, table([score])
+
+
 def test_demo_files_are_small():
     assert sum(file.stat().st_size for file in (ROOT / "figaroh_jax" / "demo").iterdir()) <= 500_000
 
