@@ -38,7 +38,7 @@ PHASES = {  # functions of the package, by what they are told as
     "search: the rest": ["diagnosis.search.find_causes"],
     "fits of all causes": ["diagnosis.joint.polished"],
     "each cause left out": ["diagnosis.search.eliminate", "diagnosis.naming.standings"],
-    "what is left": ["diagnosis.diagnosis._left", "diagnosis.rest.parts_of"],
+    "what is left": ["diagnosis.causes._left", "diagnosis.rest.parts_of"],
     "data kept out": ["diagnosis.gaining.without_losses", "diagnosis.answer_fit.as_predicts_best"],
     "next experiment": ["diagnosis.experiment.next_experiment"],
     "the rest of the diagnosis": ["diagnosis.diagnosis.diagnose"],

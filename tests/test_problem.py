@@ -16,10 +16,10 @@ import reference
 import robots
 from synthetic import DT, made_signals, swing
 
+from figaroh_jax.diagnosis.causes import possible
 from figaroh_jax.diagnosis.comparison import Verdicts
 from figaroh_jax.diagnosis.contenders import Contender
 from figaroh_jax.diagnosis.design import units
-from figaroh_jax.diagnosis.diagnosis import _possible
 from figaroh_jax.diagnosis.flexible import WIDTHS, friction_width
 from figaroh_jax.diagnosis.floor import sober_spectrum
 from figaroh_jax.diagnosis.gaining import foretells
@@ -245,9 +245,9 @@ def test_a_sign_that_physics_forbids_gives_way_to_a_law_that_does_as_well(model:
     found = cast(
         Any, Found(wrong.name, wrong.effect, 0.0, (1.0, 0.0), (1.0, 0.0), 9.0, 1.0, open_to, (0,), (), instead)
     )
-    kept = _possible([found], cast(Any, SimpleNamespace(causes=[wrong.effect])))
+    kept = possible([found], cast(Any, SimpleNamespace(causes=[wrong.effect])))
     assert kept[0].name == (wrong if told else right).name
-    assert _possible([found], cast(Any, SimpleNamespace(causes=[right.effect])))[0] is found
+    assert possible([found], cast(Any, SimpleNamespace(causes=[right.effect])))[0] is found
 
 
 def test_an_effect_exists_within_its_bounds_only(model: RobotModel) -> None:

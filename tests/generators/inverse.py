@@ -46,6 +46,7 @@ EFFECTS = (
     "backlash",
 )
 FOREIGN = outside.FOREIGN
+DIFFERS = ("part", "size", "repeat")  # how effects change from recording to recording
 
 # Pairs of names that torque data of a moving robot cannot tell apart, at the same place.
 CLASSES = (
@@ -72,6 +73,7 @@ def make_case(
     holdout: bool = False,
     trusted: bool | None = None,
     duration: float = PERIOD,
+    differs: str = "",
     **motion: Any,
 ) -> Case:
     """Recordings of `robot` with `effects` hidden: names, (name, size) or (name, size, at); size .05 if left out.
@@ -80,18 +82,26 @@ def make_case(
     for a pair, root mean square of all rows otherwise). Equal seeds give equal robots, motions and noise whatever is
     hidden. `noise` scales the noise of both sensors (0: none, and no encoder steps), `colour` is one of
     `sensors.COLOURS`; `holdout` adds one more trajectory with that role; `trusted` makes the true inertials 1 % off
-    instead of 5 %; `motion` goes to `motion.excitation` (amplitude, speed, harmonics).
+    instead of 5 %; `differs` is how effects change from recording to recording, one of `DIFFERS`; `motion` goes to
+    `motion.excitation` (amplitude, speed, harmonics).
     """
     drawn = draw_case(effects, robot, trajectories, seed, holdout=holdout, trusted=trusted, duration=duration, **motion)
-    return record_case(drawn, repeats, noise, colour=colour, encoder_step=encoder_step)
+    return record_case(drawn, repeats, noise, colour=colour, encoder_step=encoder_step, differs=differs)
 
 
 def record_case(
-    drawn: Drawn, repeats: int = 2, noise: float = 1.0, *, colour: str = "ar20", encoder_step: float = 1e-5
+    drawn: Drawn,
+    repeats: int = 2,
+    noise: float = 1.0,
+    *,
+    colour: str = "ar20",
+    encoder_step: float = 1e-5,
+    differs: str = "",
 ) -> Case:
     """The recordings of what was drawn, once: its random numbers go on from there."""
     made, model, hidden = drawn.robot, drawn.model, drawn.hidden
-    runs = _runs(made, model, drawn.motions, len(drawn.fit), repeats, drawn.time, hidden, drawn.rng)
+    shares = _shares(differs, len(drawn.motions), repeats, np.random.default_rng([drawn.seed, 11]))
+    runs = _runs(made, model, drawn.motions, len(drawn.fit), repeats, drawn.time, hidden, drawn.rng, shares)
     recordings = noisy(runs, drawn.rng, noise, colour, encoder_step)
     truth = tuple(Truth(h.effect, h.at, h.parameters(h.scale)) for h in hidden)
     induced = {h.effect: _size(made, model, drawn.fit, drawn.time, h) for h in hidden} if noise == 0 else {}
@@ -227,14 +237,19 @@ def _runs(
     time: np.ndarray,
     hidden: list[Hidden],
     rng: np.random.Generator,
+    shares: np.ndarray,
 ) -> list[dict[str, Any]]:
-    """Runs at the recording's rate, before sensor noise: every trajectory `repeats` times, a held-out one once."""
+    """Runs at the recording's rate, before sensor noise: every trajectory `repeats` times, a held-out one once.
+
+    `shares` (trajectories, repeats) are those of the effects' sizes that a run has.
+    """
     runs = []
     for number, motion in enumerate(motions):
         held = number >= trajectories
         for repeat in range(1 if held else repeats):
             followed = tracked(motion, rng)
-            q, tau = scene.run(robot, model, followed, time, hidden, rng.uniform())
+            here = [replace(h, scale=h.scale * share) for h in hidden if (share := shares[number, repeat])]
+            q, tau = scene.run(robot, model, followed, time, here, rng.uniform())
             label = chr(ord("A") + number)
             run: dict[str, Any] = {
                 "time": _averaged(time, time),
@@ -245,6 +260,20 @@ def _runs(
             run |= {"repeat": label if repeats > 1 and not held else None, "role": "holdout" if held else "fit"}
             runs.append(run)
     return runs
+
+
+def _shares(differs: str, trajectories: int, repeats: int, rng: np.random.Generator) -> np.ndarray:
+    """Which share of its size an effect has in each run, (trajectories, repeats)."""
+    shares = np.ones((trajectories, repeats))
+    if differs == "part":  # a tool that is not always on the flange
+        shares[rng.permutation(trajectories)[: rng.integers(1, trajectories)]] = 0
+    elif differs == "size":  # friction by the temperature of the day
+        shares *= rng.uniform(0.4, 1.6, (trajectories, 1))
+    elif differs == "repeat":  # what was done again was done otherwise
+        shares[:, repeats // 2 :] = 0
+    elif differs:
+        raise ValueError(f"effects do not differ by '{differs}'; known: {', '.join(DIFFERS)}")
+    return shares
 
 
 def _averaged(time: np.ndarray, x: np.ndarray) -> np.ndarray:
