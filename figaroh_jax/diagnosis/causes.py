@@ -32,6 +32,7 @@ from .rest import (
     repeating,
     roughly_predictable,
     significance,
+    still_changed,
     wrong_law,
 )
 from .search import (
@@ -276,6 +277,8 @@ def _left(
         follows = follows_others(problem, joint.step.state, tolerance)
         left = left._replace(text=follows.text if follows else left.text)
         there = bool((quiet & large).any() or rough.any() or follows)
+    if changed := still_changed(problem, joint.step, tolerance):
+        left, there, follows = left._replace(text=changed.text), True, changed
     moves = np.moveaxis(~resting(problem), 2, 0).reshape(joint.step.rows.y.shape)
     beyond, alone = (
         beyond_noise(problem, step.linear.residual, spectrum, whitening, generator, moves)[0]

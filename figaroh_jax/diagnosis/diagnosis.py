@@ -40,10 +40,11 @@ from .gaining import Gaining, without_losses
 from .holdout import residual_rms, traces
 from .joint import Joint, least_sure, opened, with_rest, without_a_number
 from .judgement import KeptOut, Searched, as_slow_noise, doubted_rest, reasons_against, standings_of, sticks_alone
-from .layout import describe_folds, repeats_not_said
+from .layout import describe_folds
 from .links import as_gain, moved_links
 from .naming import ONE_PART, lone_part, strong
 from .reading import Reader, only_read
+from .repeats import repeats_not_said
 from .rest import parts_of, relative_rest, roughly_predictable, tolerated, verdict
 from .screening import OneMore, noise_squares
 from .search import Found, Search, chance_beside

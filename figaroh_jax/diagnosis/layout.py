@@ -1,18 +1,17 @@
-"""Which rows repeat one another, which are judged together, which are left out together."""
+"""Which rows belong to repeats of one another, which are judged together, which are left out together."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..recordings.signals import SAME_MOTION, Signals, align, apart, common_rows, moves_as
+from ..recordings.signals import Signals, align
 from ..recordings.stacked import Records
 from .problem import Layout
 
-__all__ = ["checked_repeats", "describe_folds", "held_rows", "layout", "repeats_not_said"]
+__all__ = ["FOLDS", "block_width", "describe_folds", "held_rows", "layout"]
 
 BLOCK, SHORT_BLOCK, SHORT = 1.0, 0.3, 9.99  # s: of a block, of a block in recordings shorter than the third
 FOLDS = 5  # where the excitations are few: blocks go to them in turn
@@ -38,59 +37,7 @@ def layout(signals: Sequence[Signals], records: Records) -> Layout:
     else:
         partner, paired = partner[:0], np.ones((weight.shape[2], n * count))
     fold, part = _folds(signals, records, SLICED), _folds(signals, records, QUARTERED)
-    return Layout(partner, paired, _blocks(signals, records), fold, part, repeats)
-
-
-def checked_repeats(signals: Sequence[Signals]) -> list[Signals]:
-    """The recordings, each repeat with a note of how near it is; one that moves otherwise loses its label.
-
-    What two recordings of other motions differ by is no noise: without the label they are two excitations.
-    """
-    out, leaders = [], {}
-    for one in signals:
-        leader = leaders.setdefault(one.repeat, one) if one.repeat and one.role == "fit" else one
-        if leader is one:
-            out.append(one)
-            continue
-        note = _compared(leader, one)
-        if apart(leader, one) > SAME_MOTION:
-            text = f"{one.name} does not repeat {leader.name}: {note}; taken as another excitation"
-            out.append(replace(one, repeat=None, notes=(*one.notes, text)))
-        else:
-            out.append(replace(one, notes=(*one.notes, f"{one.name} repeats {leader.name}: {note}")))
-    return out
-
-
-def repeats_not_said(signals: Sequence[Signals]) -> tuple[str, ...]:
-    """Notes on fitted recordings that move as another one does though no label says so: they could tell the noise."""
-
-    def before(k: int) -> Iterator[Signals]:
-        one = fitted[k]
-        return (o for o in fitted[:k] if not (one.repeat and o.repeat) and _as_long_and_far(o, one))
-
-    fitted = [one for one in signals if one.role == "fit"]
-    likes = [moves_as(one, before(k)) for k, one in enumerate(fitted)]
-    text = "{} moves as {} does: with the same `repeat` under `data` their differences would tell the noise"
-    return tuple(text.format(one.name, like.name) for one, like in zip(fitted, likes, strict=True) if like)
-
-
-def _as_long_and_far(first: Signals, second: Signals) -> bool:
-    """Whether two recordings last as long and their joints move as far; without that none repeats the other."""
-    ends = [one.time[-1] - one.time[0] for one in (first, second)]
-    far = [np.ptp(one.position, axis=0) for one in (first, second)]
-    return max(ends) <= 1.2 * min(ends) and bool(np.all(np.abs(far[0] - far[1]) <= 0.2 * np.max(far, axis=0)))
-
-
-def _compared(first: Signals, second: Signals) -> str:
-    """How two repeats differ, in words."""
-    own, other = common_rows(first, second)
-    q, p = first.position[first.rows.index[own]], second.position[second.rows.index[other]]
-    late = 1e3 * float(np.mean(second.rows.row_times[other] - first.rows.row_times[own]))
-    text = f"its clock is {late:+.4g} ms off, positions within {(q - p).std(axis=0).max():.2g} rad (or m)"
-    if first.torque is not None and second.torque is not None:
-        torque = first.torque[first.rows.index[own]] - second.torque[second.rows.index[other]]
-        text += f", torques within {torque.std(axis=0).max():.2g} N m (or N)"
-    return text
+    return Layout(partner, paired, _blocks(signals, records), fold, part, repeats, _changed(signals, records))
 
 
 def held_rows(signals: Sequence[Signals], records: Records) -> Float[np.ndarray, "n M nv"]:
@@ -127,10 +74,28 @@ def _partners(signals: Sequence[Signals], records: Records) -> Int[np.ndarray, "
         own = np.arange(signals[one].rows.kept)
         others = [k for k in range(len(labels)) if k != one and labels[k] == labels[one]]
         for slot, other in enumerate(others):
-            row = own + align(signals[one], signals[other])
-            inside = (row >= 0) & (row < signals[other].rows.kept)
-            partner[slot, first[one] + own] = np.where(inside, first[other] + row, -1)
+            partner[slot, first[one] + own] = _same_rows(signals[one], signals[other], first[other])
     return partner
+
+
+def _same_rows(one: Signals, other: Signals, first: int) -> Int[np.ndarray, " rows"]:
+    """Row of another recording that moves alike, whose rows stand from `first` on, for each row of one; -1 without."""
+    row = np.arange(one.rows.kept) + align(one, other)
+    return np.where((row >= 0) & (row < other.rows.kept), first + row, -1)
+
+
+def _changed(signals: Sequence[Signals], records: Records) -> Int[np.ndarray, " T"] | None:
+    """Row of the recording that moves alike, but with another torque, -1 where there is none; None without any."""
+    if not any(one.changed_since for one in signals):
+        return None
+    n, _, count, _ = records.shape
+    out, first = np.full(n * count, -1), [at.slot * count + at.row for at in records.spans]
+    numbers = {one.name: k for k, one in enumerate(signals)}
+    for one, begin in zip(signals, first, strict=False):
+        if one.changed_since:
+            other = numbers[one.changed_since]
+            out[begin : begin + one.rows.kept] = _same_rows(one, signals[other], first[other])
+    return out
 
 
 def _blocks(signals: Sequence[Signals], records: Records) -> Int[np.ndarray, " T"]:
@@ -138,14 +103,14 @@ def _blocks(signals: Sequence[Signals], records: Records) -> Int[np.ndarray, " T
     block, start = np.full((n, count), -1), 0
     for one, at in zip((s for s in signals if s.role == "fit"), records.spans, strict=False):
         seconds = np.arange(at.rows) / float(records.rate)
-        width = _width(one)
+        width = block_width(one)
         number = np.minimum(seconds / width, max(1, round(seconds[-1] / width)) - 1).astype(int)
         block[at.slot, at.row : at.row + at.rows] = start + number
         start += number[-1] + 1
     return block.reshape(-1)
 
 
-def _width(one: Signals) -> float:
+def block_width(one: Signals) -> float:
     """Seconds of a block: a recording is to have many."""
     return BLOCK if one.time[-1] - one.time[0] > SHORT else SHORT_BLOCK
 
@@ -165,7 +130,7 @@ def _folds(signals: Sequence[Signals], records: Records, sliced: bool) -> Int[np
     for k, (one, at) in enumerate(zip(fitted, records.spans, strict=False)):
         late = align(fitted[first.setdefault(labels[k], k)], one) if one.repeat else 0
         row = np.maximum(np.arange(at.rows) - late, 0)  # repeats share their slices
-        slices = row / float(records.rate) // _width(one) % FOLDS
+        slices = row / float(records.rate) // block_width(one) % FOLDS
         quarter = labels[k] * QUARTERS + np.minimum(row * QUARTERS // max(one.rows.kept, 1), QUARTERS - 1)
         fold[at.slot, at.row : at.row + at.rows] = labels[k] if enough else slices if sliced else quarter
     used = np.unique(fold[fold >= 0])

@@ -345,6 +345,7 @@ class Layout(eqx.Module):
     fold: Int[np.ndarray, " T"]  # by which causes are chosen: excitations, or slices in turn where they are few
     part: Int[np.ndarray, " T"]  # by which the gain is told: excitations, or quarters that follow one another
     repeats: bool = eqx.field(static=True)
+    changed: Int[np.ndarray, " T"] | None = None  # row of a recording alike but for its torque, or -1
 
 
 @dataclass(frozen=True)

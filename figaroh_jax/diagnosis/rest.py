@@ -16,9 +16,11 @@ from ..results import Dependence, Part, Verdict
 from .comparison import ground, judge_grown, t_needed, t_value
 from .flexible import Smooth, dependences, products, rough_functions
 from .holdout import residual_rms
+from .layout import FOLDS
 from .problem import Problem
+from .repeats import CHANGED_SQUARES, foretold_by_others
 from .screening import CHUNK, Group, draw_noise, noise_squares
-from .state import State
+from .state import State, plain_rows
 from .step import Step, stand
 from .thresholds import (
     FITTED,
@@ -52,6 +54,7 @@ __all__ = [
     "repeating",
     "roughly_predictable",
     "significance",
+    "still_changed",
     "tolerated",
     "verdict",
     "wrong_law",
@@ -340,6 +343,39 @@ def _dependences(problem: Problem, state: State, joint: int) -> list[tuple[Depen
             own[at.slot, at.sample : at.sample + at.samples] = 1.0
         kinds.append(("recording", constants.reshape(len(fitted), -1)))
     return kinds
+
+
+def still_changed(problem: Problem, step: Step, tolerance: float) -> Follows | None:
+    """The joint where recordings that move alike leave another torque, in a way that follows its motion; None without.
+
+    What one robot and its drives make of a motion is the same each time but for noise, whatever the model lacks.
+    """
+    same, worst = problem.layout.changed, 0.0
+    if same is None:
+        return None
+    found, names, size = None, problem.model.dof_names, np.sqrt(np.mean(problem.torque**2, axis=(0, 1)))
+    rows, white = plain_rows(problem, step.state), np.ones((len(problem.records.omega), problem.model.nv))
+    residual = rows.y - rows.X @ step.state.theta
+    for joint in np.flatnonzero(size > 0).tolist():
+        used = (same >= 0) & (rows.block >= 0) & (rows.y[joint] != 0) & (rows.y[joint, same] != 0)
+        y = (residual[joint] - residual[joint, same])[used]
+        if not len(y):
+            continue
+        slices, left = rows.block[used] % FOLDS, float(np.var(y))
+        for functions in dependences(step.state.motion, joint).values():
+            own = _rows_at(problem, step.state, functions, white, joint)[:, used]
+            own = np.vstack([np.ones(own.shape[1]), own]).T
+            left = min(left, float(np.mean((y - foretold_by_others(y, own, slices)) ** 2)))
+        followed = float(np.sqrt(max(np.var(y) - left, 0.0)))
+        if left < (1 - CHANGED_SQUARES) * np.var(y) and followed / size[joint] > max(tolerance, worst):
+            worst, most = followed / size[joint], np.full(len(size), np.inf)
+            most[joint] = np.sqrt(left / 2)
+            text = (
+                f"the torque of {names[joint]} is another one in recordings that move alike, by {worst:.2g} of its RMS,"
+                " most of which follows the motion: the robot, its load or a sensor changed between them"
+            )
+            found = Follows(text, most)
+    return found
 
 
 def _rows_at(

@@ -20,8 +20,9 @@ from .flexible import friction_width
 from .floor import noise_floor, noise_rms, whitening_of
 from .holdout import fold_squares, residual_rms
 from .joint import Joint
-from .layout import checked_repeats, held_rows, layout
+from .layout import held_rows, layout
 from .problem import Problem
+from .repeats import checked_repeats
 from .state import State, baseline, stated_effects, with_width
 from .step import stand, with_causes
 from .thresholds import MOST_OF_RESIDUAL, OF_ANOTHER_WIDTH, PASSED_FOR_NOISE, WEIGHT_ROUNDS
@@ -73,7 +74,7 @@ def prepared_signals(
     def read(band: Band, like: _Read | None = None) -> _Read:
         sticks = known is None or known.coulomb
         prepared = prepare_all(recordings, preprocess, band=band, resampled=resampled, sticks=sticks)
-        signals = sorted(checked_repeats(prepared), key=lambda s: s.role == "holdout")
+        signals = sorted(checked_repeats(prepared, backend.robot.dof_names), key=lambda s: s.role == "holdout")
         if like and like.moves_as(signals):
             return like
         begun = _begun(backend, signals, known, trust)

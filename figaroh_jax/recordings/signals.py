@@ -103,6 +103,7 @@ class Signals:
     load: Load | None  # known payload carried
     notes: tuple[str, ...]
     stands: Bool[np.ndarray, "rows nv"] | None = None  # rows without weight because the joint stands; None: no row
+    changed_since: str | None = None  # the recording that moves alike, but with another torque
 
 
 # by recording and shift: rate and gaps of its even grid, then times and columns at the working rate
