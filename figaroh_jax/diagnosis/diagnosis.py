@@ -32,6 +32,7 @@ from ..simulators.registry import backend as make_backend
 from .answer_fit import as_moves, as_predicts_best, as_weighed_in_motion, as_weighed_otherwise, together
 from .believed import impossible_links
 from .causes import UNSURE, searched_causes, told_size
+from .constancy import recordings_that_differ
 from .estimates import estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
@@ -368,6 +369,7 @@ def _answer(
         links=moved_links(problem, first, last, here.whitening, welded),
         notes=(
             *_notes(signals, here, last),
+            *recordings_that_differ(problem, joint, [str(f.name) for f in named], [s.name for s in signals]),
             *([_LINKS_HELD] if judged.causes.links_held else []),
             *([_AT_REST] if judged.sticks else []),
         ),
