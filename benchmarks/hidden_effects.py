@@ -7,6 +7,7 @@
     python benchmarks/hidden_effects.py --foreign --size 0.08                # laws that no catalogue holds
     python benchmarks/hidden_effects.py --closed-loop --robots ur10e         # MuJoCo C in place of inverse dynamics
     python benchmarks/hidden_effects.py --several 5 --cases 20               # five at once, as in a real robot
+    python benchmarks/hidden_effects.py --differs part --size 0.1            # in some of the recordings only
 
 The recordings come from Pinocchio or MuJoCo C (`tests/generators`), which share no code with the library.
 """
@@ -30,6 +31,7 @@ import numpy as np  # noqa: E402
 from generators import (  # noqa: E402
     CLASSES,
     CLOSED_LOOP_EFFECTS,
+    DIFFERS,
     EFFECTS,
     FOREIGN,
     Case,
@@ -118,6 +120,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--foreign", action="store_true", help="hide laws that stand in no catalogue")
     parser.add_argument("--closed-loop", action="store_true", help="MuJoCo C in place of inverse dynamics")
     parser.add_argument("--several", type=int, default=0, metavar="K", help="K effects of 2 to 15 %% at once")
+    parser.add_argument("--differs", choices=DIFFERS, help="how the effects change from recording to recording")
     parser.add_argument("--cases", type=int, default=12, help="of several effects (default 12)")
     return parser.parse_args()
 
@@ -127,6 +130,8 @@ def _cases(args: argparse.Namespace) -> Iterator[tuple[str, Case, tuple[str, ...
     make = make_closed_loop_case if args.closed_loop else make_case
     if args.trusted:
         make = partial(make, trusted=True)
+    if args.differs:
+        make = partial(make, differs=args.differs)
     for number in range(args.clean):
         layout = args.layouts[number % len(args.layouts)]
         robot, seed = args.robots[number // 2 % len(args.robots)], args.seeds[0] + number

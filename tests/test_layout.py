@@ -13,7 +13,8 @@ import robots
 from synthetic import DT, STEP, made_signals, swing
 
 from figaroh_jax.diagnosis import shifts
-from figaroh_jax.diagnosis.layout import describe_folds, excitations, held_rows, layout, repeats_not_said
+from figaroh_jax.diagnosis.layout import describe_folds, excitations, held_rows, layout
+from figaroh_jax.diagnosis.repeats import repeats_not_said
 from figaroh_jax.effects.base import Motion
 from figaroh_jax.effects.sensors import EncoderScale
 from figaroh_jax.recordings.signals import Signals, apart, kept_out_in_vain

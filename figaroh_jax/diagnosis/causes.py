@@ -12,6 +12,7 @@ from ..effects.catalogue import CATALOGUE, find, related
 from ..results import Name, Nearest
 from .answer_fit import together
 from .comparison import t_value
+from .constancy import of_one_recording, still_changed
 from .drives import rotors_for_bodies
 from .estimates import amplitude_places, estimates
 from .flexible import families, flexible_p
@@ -32,7 +33,6 @@ from .rest import (
     repeating,
     roughly_predictable,
     significance,
-    still_changed,
     wrong_law,
 )
 from .search import (
@@ -275,6 +275,7 @@ def _left(
         large = relative_rest(problem, joint.step.state, 0 * noise) > tolerance
         rough = roughly_predictable(problem, joint.step, whitening, tolerance)
         follows = follows_others(problem, joint.step.state, tolerance)
+        follows = follows or of_one_recording(problem, joint.step, tolerance)
         left = left._replace(text=follows.text if follows else left.text)
         there = bool((quiet & large).any() or rough.any() or follows)
     if changed := still_changed(problem, joint.step, tolerance):

@@ -9,15 +9,23 @@ from jaxtyping import Bool, Float, Int
 
 from ..estimation.rows import block_sums, model_sums
 from .estimates import amplitude_places
+from .flexible import dependences
+from .holdout import residual_rms
 from .joint import Joint
+from .layout import FOLDS
 from .problem import Problem
+from .repeats import CHANGED_SQUARES, foretold_by_others
+from .rest import Follows, rows_at
+from .state import State, plain_rows
+from .step import Step
 
-__all__ = ["recordings_that_differ", "shares_by_recording"]
+__all__ = ["of_one_recording", "recordings_that_differ", "shares_by_recording", "still_changed"]
 
 CHANGES = 0.5  # of a cause's size: recordings that differ by less are said to have the same
 KEPT = 1e-12  # of the diagonal: a ridge for numbers that no row shows
 MOST_TOLD = 8  # recordings: of more, those with the least and the most
 NONE = 0.2  # of its size: a recording that surely has less of it has none to speak of
+RIDGE = 1e-4  # of a column's squares, of those that a recording alone is fitted with
 SURE = 4.0  # standard deviations by which they differ
 
 
@@ -31,7 +39,7 @@ def recordings_that_differ(problem: Problem, joint: Joint, causes: Sequence[str]
         low, high = int(np.argmin(share + deviation)), int(np.argmax(share - deviation))
         apart = share[high] - share[low]
         if apart > CHANGES and apart > SURE * np.hypot(deviation[low], deviation[high]):
-            order = np.argsort(share).tolist()
+            order = [int(k) for k in np.argsort(share)]
             shown = order if len(order) <= MOST_TOLD else [*order[: MOST_TOLD // 2], *order[-MOST_TOLD // 2 :]]
             told = ", ".join(f"{share[r]:.2f} +- {1.96 * deviation[r]:.2f} in {names[which[r]]}" for r in shown)
             absent = share[low] + 1.96 * deviation[low] < NONE
@@ -78,6 +86,98 @@ def shares_by_recording(
     return value[count:], deviation[count:], np.array([number for number, _ in recordings])
 
 
+def still_changed(problem: Problem, step: Step, tolerance: float) -> Follows | None:
+    """The joint where recordings that move alike leave another torque, in a way that follows its motion; None without.
+
+    What one robot and its drives make of a motion is the same each time but for noise, whatever the model lacks.
+    """
+    same, worst = problem.layout.changed, 0.0
+    if same is None:
+        return None
+    found, names, size = None, problem.model.dof_names, np.sqrt(np.mean(problem.torque**2, axis=(0, 1)))
+    rows, white = plain_rows(problem, step.state), np.ones((len(problem.records.omega), problem.model.nv))
+    residual = rows.y - rows.X @ step.state.theta
+    for joint in np.flatnonzero(size > 0).tolist():
+        used = (same >= 0) & (rows.block >= 0) & (rows.y[joint] != 0) & (rows.y[joint, same] != 0)
+        y = (residual[joint] - residual[joint, same])[used]
+        if not len(y):
+            continue
+        slices, left = rows.block[used] % FOLDS, float(np.var(y))
+        for functions in dependences(step.state.motion, joint).values():
+            own = rows_at(problem, step.state, functions, white, joint)[:, used]
+            own = np.vstack([np.ones(own.shape[1]), own]).T
+            left = min(left, float(np.mean((y - foretold_by_others(y, own, slices)) ** 2)))
+        followed = float(np.sqrt(max(np.var(y) - left, 0.0)))
+        if left < (1 - CHANGED_SQUARES) * np.var(y) and followed / size[joint] > max(tolerance, worst):
+            worst, most = followed / size[joint], np.full(len(size), np.inf)
+            most[joint] = np.sqrt(left / 2)
+            text = (
+                f"the torque of {names[joint]} is another one in recordings that move alike, by {worst:.2g} of its RMS,"
+                " most of which follows the motion: the robot, its load or a sensor changed between them"
+            )
+            found = Follows(text, most)
+    return found
+
+
+def of_one_recording(problem: Problem, step: Step, tolerance: float) -> Follows | None:
+    """The joint of which a recording by itself explains most of what a fit of all leaves there; None without.
+
+    What passes for noise, where no repeats tell it, may be a tool that only some recordings carry or friction that was
+    another one: links at the end of the robot, friction and rotors fitted to some slices of a recording then foretell
+    the others. Noise of slices does not, whatever its spectrum is. Constants say nothing, as torque sensors drift.
+    """
+    rows, size = plain_rows(problem, step.state), np.sqrt(np.mean(problem.torque**2, axis=(0, 1)))
+    recordings = [used for _, used in _fitted(problem, rows.block)]
+    if len(recordings) < 2:
+        return None
+    scale = np.maximum(residual_rms(problem, step.state), 1e-9 * max(float(size.max()), 1e-300))[:, None]
+    residual = (rows.y - rows.X @ step.state.theta) / scale
+    columns = rows.X.dense()[..., _of_ends(problem, step.state)] / scale[..., None]
+    all_of_it, left = np.zeros((2, len(size)))
+    for used in recordings:
+        there = rows.y[:, used] != 0
+        e = residual[:, used] * there
+        e -= there * (e.sum(1) / np.maximum(there.sum(1), 1))[:, None]
+        foretold = _foretold_together(e, columns[:, used] * there[..., None], rows.block[used] % FOLDS)
+        all_of_it += (e**2).sum(1)
+        left += ((e - foretold) ** 2).sum(1)
+    count = np.maximum((rows.y != 0).sum(1), 1)
+    followed = scale[:, 0] * np.sqrt(np.maximum(all_of_it - left, 0.0) / count) / np.maximum(size, 1e-300)
+    surely = (left < (1 - CHANGED_SQUARES) * all_of_it) & (followed > tolerance) & (size > 0)
+    if not surely.any():
+        return None
+    joint = int(np.argmax(np.where(surely, followed, 0.0)))
+    most = np.full(len(size), np.inf)
+    most[joint] = scale[joint, 0] * np.sqrt(left[joint] / count[joint])
+    text = (
+        f"most of what {problem.model.dof_names[joint]} leaves ({followed[joint]:.2g} of its torque) goes with links"
+        " and friction that each recording has for itself: the robot, its load or its temperature was not the same in"
+        " all"
+    )
+    return Follows(text, most)
+
+
+def _of_ends(problem: Problem, state: State) -> list[int]:
+    """Columns of the links that carry no other, and of all friction and rotors, among those of a state."""
+    joints = problem.model.joints
+    ends = [k for k in range(len(joints)) if not any(other.parent == k for other in joints)]
+    return [*(10 * k + i for k in ends for i in range(10)), *range(10 * len(joints), len(state.theta))]
+
+
+def _foretold_together(
+    e: Float[np.ndarray, "nv rows"], Z: Float[np.ndarray, "nv rows k"], slices: Int[np.ndarray, " rows"]
+) -> Float[np.ndarray, "nv rows"]:
+    """What columns that all joints share say of each slice, fitted to the others."""
+    scale = np.sqrt(np.maximum((Z**2).sum((0, 1)), 1e-300))
+    Z, out = Z / scale, np.zeros_like(e)
+    for number in np.unique(slices):
+        own = slices == number
+        F = Z[:, ~own].reshape(-1, Z.shape[2])
+        theta = np.linalg.solve(F.T @ F + RIDGE * np.eye(F.shape[1]), F.T @ e[:, ~own].reshape(-1))
+        out[:, own] = Z[:, own] @ theta
+    return out
+
+
 def _fitted(problem: Problem, block: Int[np.ndarray, " T"]) -> Iterator[tuple[int, Bool[np.ndarray, " T"]]]:
     """Number and rows of each recording that is fitted."""
     n, _, count, _ = problem.records.shape
@@ -95,5 +195,5 @@ def _all_but(theta: Float[np.ndarray, " P"], at: Sequence[int]) -> Float[np.ndar
     rest = np.setdiff1d(np.arange(len(theta)), at)
     out = np.zeros((len(theta), len(theta) - 1))
     out[rest, np.arange(len(rest))] = 1.0
-    out[np.ix_(at, np.arange(len(rest), len(theta) - 1))] = own
+    out[list(at), len(rest) :] = own
     return out

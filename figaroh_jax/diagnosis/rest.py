@@ -16,11 +16,9 @@ from ..results import Dependence, Part, Verdict
 from .comparison import ground, judge_grown, t_needed, t_value
 from .flexible import Smooth, dependences, products, rough_functions
 from .holdout import residual_rms
-from .layout import FOLDS
 from .problem import Problem
-from .repeats import CHANGED_SQUARES, foretold_by_others
 from .screening import CHUNK, Group, draw_noise, noise_squares
-from .state import State, plain_rows
+from .state import State
 from .step import Step, stand
 from .thresholds import (
     FITTED,
@@ -45,6 +43,7 @@ __all__ = [
     "Significance",
     "beyond_noise",
     "excess",
+    "Follows",
     "follows_others",
     "lines",
     "parts_of",
@@ -53,8 +52,8 @@ __all__ = [
     "repeated_power",
     "repeating",
     "roughly_predictable",
+    "rows_at",
     "significance",
-    "still_changed",
     "tolerated",
     "verdict",
     "wrong_law",
@@ -242,7 +241,7 @@ def roughly_predictable(
     base = ground(step.verdicts, step.state.prior, step.folded)
     for joint in joints.tolist():
         for columns in rough_functions(step.state.motion, joint):
-            rows = _rows_at(problem, step.state, columns, whitening, joint)
+            rows = rows_at(problem, step.state, columns, whitening, joint)
             if moving is not None:
                 rows = rows * moving.reshape(-1)
             grown = judge_grown(step.rows, base, (joint,), rows[:, None])
@@ -275,7 +274,7 @@ def follows_others(problem: Problem, state: State, tolerance: float) -> Follows 
     step = stand(problem, state, white)
     base, (columns, places) = ground(step.verdicts, step.state.prior, step.folded), products(step.state.motion)
     for joint in large:
-        rows = _rows_at(problem, step.state, columns, white, joint)
+        rows = rows_at(problem, step.state, columns, white, joint)
         across, pull = step.rows.X.pulled_at((joint,), rows[:, None]).T, rows @ step.verdicts.residual[joint]
         gram = rows @ rows.T - across.T @ base.inverse[-1] @ across
         taken = [pull[at] @ np.linalg.lstsq(gram[np.ix_(at, at)], pull[at], rcond=None)[0] for at in map(list, places)]
@@ -319,7 +318,7 @@ def parts_of(
         still = float(beyond[speed[joint][used] < STANDSTILL].sum()) / total
         shares: list[_Share] = [(still, "standstill", None, None)]
         for kind, columns in _dependences(problem, step.state, joint):
-            rows = _rows_at(problem, step.state, columns, whitening, joint)
+            rows = rows_at(problem, step.state, columns, whitening, joint)
             grown = judge_grown(step.rows, base, (joint,), rows[:, None])
             worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, grown))
             if t_value(worse, better) > T_BETTER:
@@ -345,40 +344,7 @@ def _dependences(problem: Problem, state: State, joint: int) -> list[tuple[Depen
     return kinds
 
 
-def still_changed(problem: Problem, step: Step, tolerance: float) -> Follows | None:
-    """The joint where recordings that move alike leave another torque, in a way that follows its motion; None without.
-
-    What one robot and its drives make of a motion is the same each time but for noise, whatever the model lacks.
-    """
-    same, worst = problem.layout.changed, 0.0
-    if same is None:
-        return None
-    found, names, size = None, problem.model.dof_names, np.sqrt(np.mean(problem.torque**2, axis=(0, 1)))
-    rows, white = plain_rows(problem, step.state), np.ones((len(problem.records.omega), problem.model.nv))
-    residual = rows.y - rows.X @ step.state.theta
-    for joint in np.flatnonzero(size > 0).tolist():
-        used = (same >= 0) & (rows.block >= 0) & (rows.y[joint] != 0) & (rows.y[joint, same] != 0)
-        y = (residual[joint] - residual[joint, same])[used]
-        if not len(y):
-            continue
-        slices, left = rows.block[used] % FOLDS, float(np.var(y))
-        for functions in dependences(step.state.motion, joint).values():
-            own = _rows_at(problem, step.state, functions, white, joint)[:, used]
-            own = np.vstack([np.ones(own.shape[1]), own]).T
-            left = min(left, float(np.mean((y - foretold_by_others(y, own, slices)) ** 2)))
-        followed = float(np.sqrt(max(np.var(y) - left, 0.0)))
-        if left < (1 - CHANGED_SQUARES) * np.var(y) and followed / size[joint] > max(tolerance, worst):
-            worst, most = followed / size[joint], np.full(len(size), np.inf)
-            most[joint] = np.sqrt(left / 2)
-            text = (
-                f"the torque of {names[joint]} is another one in recordings that move alike, by {worst:.2g} of its RMS,"
-                " most of which follows the motion: the robot, its load or a sensor changed between them"
-            )
-            found = Follows(text, most)
-    return found
-
-
-def _rows_at(
+def rows_at(
     problem: Problem, state: State, columns: Float[np.ndarray, "k nN"], whitening: np.ndarray, joint: int
 ) -> Float[np.ndarray, "k T"]:
     n, samples, _, _ = problem.records.shape

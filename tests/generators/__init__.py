@@ -6,12 +6,13 @@ not wrong in the same way on both sides. `make_case` hides effects of given size
 
 from .case import Case, Truth
 from .closed_loop import CLOSED_LOOP_EFFECTS, make_closed_loop_case
-from .inverse import CLASSES, EFFECTS, FOREIGN, make_case, observable
+from .inverse import CLASSES, DIFFERS, EFFECTS, FOREIGN, make_case, observable
 from .robots import available
 
 __all__ = [
     "CLASSES",
     "CLOSED_LOOP_EFFECTS",
+    "DIFFERS",
     "EFFECTS",
     "FOREIGN",
     "Case",

@@ -262,6 +262,11 @@ def _runs(
     return runs
 
 
+def shares_of(case: Case, differs: str, trajectories: int, repeats: int) -> np.ndarray:
+    """Which share of its size the effect of a case without held-out recordings has in each of its recordings."""
+    return _shares(differs, trajectories, repeats, np.random.default_rng([case.seed, 11])).ravel()
+
+
 def _shares(differs: str, trajectories: int, repeats: int, rng: np.random.Generator) -> np.ndarray:
     """Which share of its size an effect has in each run, (trajectories, repeats)."""
     shares = np.ones((trajectories, repeats))
@@ -269,10 +274,10 @@ def _shares(differs: str, trajectories: int, repeats: int, rng: np.random.Genera
         shares[rng.permutation(trajectories)[: rng.integers(1, trajectories)]] = 0
     elif differs == "size":  # friction by the temperature of the day
         shares *= rng.uniform(0.4, 1.6, (trajectories, 1))
-    elif differs == "repeat":  # what was done again was done otherwise
+    elif differs == "repeat" and repeats > 1:  # what was done again was done otherwise
         shares[:, repeats // 2 :] = 0
     elif differs:
-        raise ValueError(f"effects do not differ by '{differs}'; known: {', '.join(DIFFERS)}")
+        raise ValueError(f"effects do not differ by '{differs}' in {repeats} repeats; known: {', '.join(DIFFERS)}")
     return shares
 
 
