@@ -1,7 +1,8 @@
-"""One or two hidden effects in an arm of six servos: verdicts from command and position alone.
+"""Hidden effects in an arm of six servos: verdicts from command and position alone.
 
     python benchmarks/arm_cases.py --seeds 1 2 [--effects payload none] [--sizes 0 1 2] [--noise white|coloured|counts]
     python benchmarks/arm_cases.py --seeds 1 --pairs
+    python benchmarks/arm_cases.py --seeds 1 2 3 --several 4 [--recordings 4]  # of any sizes
     python benchmarks/arm_cases.py --seeds 1 --forbid
     python benchmarks/arm_cases.py --seeds 1 --own            # a detent, an effect that a user registers
     python benchmarks/arm_cases.py --seeds 1 --registered     # it is looked for, but not there
@@ -18,6 +19,7 @@ import argparse
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -158,6 +160,7 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--noise", choices=["white", "coloured", "counts"], default="white")
     parser.add_argument("--pairs", action="store_true", help="two effects at a time, of the middle size")
+    parser.add_argument("--several", type=int, default=0, metavar="K", help="K effects at a time, of any sizes")
     parser.add_argument("--own", action="store_true", help="an effect that is no one of the library's, registered here")
     parser.add_argument("--registered", action="store_true", help="that effect is registered, but not hidden")
     parser.add_argument("--forbid", action="store_true", help="leave the true effect out of the catalogue")
@@ -198,6 +201,8 @@ def _cases(args: argparse.Namespace, rng: np.random.Generator) -> list[list[tupl
 
     if args.own:
         return [[("detent", int(rng.integers(0, 5)), servo_arm6.DETENT[size])] for size in args.sizes]
+    if args.several:
+        return [_several(args.several, rng, one)]
     effects = list(servo_arm6.EFFECTS)
     if args.pairs:
         pairs = [rng.choice(len(effects), 2, replace=False) for _ in range(3)]
@@ -206,6 +211,22 @@ def _cases(args: argparse.Namespace, rng: np.random.Generator) -> list[list[tupl
     for effect in args.effects:
         cases += [[]] if effect == "none" else [[one(effect, size)] for size in args.sizes]
     return cases
+
+
+def _several(
+    count: int, rng: np.random.Generator, one: Callable[[str, int], tuple[str, int, float]]
+) -> list[tuple[str, int, float]]:
+    """Effects of which the generator can hide all at once: one spring, and one that changes a joint's friction."""
+    apart = ({"joint_elasticity", "backlash"}, {"stribeck_friction", "load_dependent_friction"})
+    hidden: list[tuple[str, int, float]] = []
+    for effect in rng.permutation([*servo_arm6.EFFECTS, *servo_arm6.MORE]):
+        new = one(str(effect), int(rng.integers(3)))
+        others = {x for x, joint, _ in hidden if joint == new[1] or x in apart[0]}
+        if not any(new[0] in pair and pair & others for pair in apart):
+            hidden.append(new)
+        if len(hidden) == count:
+            break
+    return hidden
 
 
 if __name__ == "__main__":

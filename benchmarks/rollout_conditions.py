@@ -1,7 +1,13 @@
 """Command and position as strangers record them: `diagnose` and `identify` of robots, drives and clocks that are drawn.
 
     python benchmarks/rollout_conditions.py --seeds 0 60 [--effects nothing payload] [--most 3] [--commands diagnose]
+    python benchmarks/rollout_conditions.py --differ --seeds 0 60 [--effects warming battery]
     python benchmarks/rollout_conditions.py --files FOLDER [FOLDER ...] [--part K N]
+
+With `--differ` the robot is not the same in all of its two to four recordings: some have what others lack (a tool, a
+base that is not level, a late command, another zero or gain of a joint), or it comes by and by (a battery that drains,
+joints that grow warm). The effect's own name is right, with or without that; `blind` is `nothing` beside recordings,
+kept out or not, of which the model leaves more than twice the noise.
 
 With `--files` MuJoCo C moves the robots of the MJCF files there, whose joints are single axes, by sines at each
 actuator; damping, friction and rotors are off in every other one. Nothing is hidden. Commands are those of the drives,
@@ -52,6 +58,18 @@ EFFECTS = (
     "dead_band",
     "torque_ripple",
 )
+BLIND = 2.0  # times the noise
+DIFFERING = {  # from recording to recording: what may be named of it; at a joint, at all of them or of the whole robot
+    "payload": ("payload", "link_inertia"),
+    "gravity_tilt": ("gravity_tilt",),
+    "command_delay": ("command_delay",),
+    "late_recorder": ("command_delay",),
+    "encoder_offset": ("encoder_offset",),
+    "actuator_gain": ("actuator_gain",),
+    "battery": ("actuator_gain", "actuator_saturation"),
+    "warming": (),
+}
+BY_AND_BY = ("battery", "warming")
 DRIVES = ("position", "position", "limited", "geared", "general", "filtered", "stated")
 AXES = ("1 0 0", "0 1 0", "0 0 1", "0 -1 0", "0.6 0 0.8", "0 0.8 0.6")
 
@@ -78,12 +96,22 @@ class Case(NamedTuple):
     recordings: list[dict[str, np.ndarray]]
     truth: tuple[str, str] | None
     numbers: dict[str, float]
+    differs: bool = False
+
+
+class Hidden(NamedTuple):
+    """What is hidden at a joint, and its size; that of each recording, where they differ, stands in its place."""
+
+    effect: str
+    joint: int
+    size: float
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", nargs=2, type=int, default=[0, 60], metavar=("FIRST", "END"))
-    parser.add_argument("--effects", nargs="+", choices=["nothing", *EFFECTS], default=[])
+    parser.add_argument("--effects", nargs="+", choices=sorted({"nothing", *EFFECTS, *DIFFERING}), default=[])
+    parser.add_argument("--differ", action="store_true", help="effects that not all recordings have alike")
     parser.add_argument("--most", type=int, default=4, help="joints of a robot")
     parser.add_argument("--integrators", nargs="+", default=["implicitfast", "implicitfast", "Euler", "Euler", "RK4"])
     parser.add_argument("--drives", nargs="+", choices=DRIVES, default=DRIVES)
@@ -108,7 +136,7 @@ def main() -> None:
         effect = case.told.split(",", 1)[0].split()[0]
         for job, mark in zip(args.commands, marks, strict=True):
             count[f"{job} {effect}", mark] += 1
-        if any(mark in ("wrong", "error", "warning") for mark in marks):
+        if any(mark in ("wrong", "blind", "error", "warning") for mark in marks):
             odd.append(line)
     if inside:
         held, all_of = (sum(x) for x in zip(*inside, strict=True))
@@ -120,7 +148,8 @@ def main() -> None:
 
 def drawn(rng: np.random.Generator, args: argparse.Namespace) -> Case | None:
     """A case, or None where the robot's own simulation does not stay where it is commanded."""
-    every = args.effects or (["nothing"] if rng.random() < 0.5 else list(EFFECTS))
+    known = list(DIFFERING) if args.differ else list(EFFECTS)
+    every = args.effects or (["nothing"] if rng.random() < 0.5 and not args.differ else known)
     effect = str(rng.choice(every))
     robot = _robot(rng, args.most, args.drives)
     n, j = len(robot.names), int(rng.integers(len(robot.names)))
@@ -132,16 +161,19 @@ def drawn(rng: np.random.Generator, args: argparse.Namespace) -> Case | None:
     number, seconds = int(rng.integers(1, 4)), float(rng.choice([6.0, 12.0, 20.0]))
     motion = str(rng.choice(["waves", "waves", "steps", "one after another"]))
     option = f'timestep="{step}" integrator="{scheme}"'
+    shares = np.ones(number)
+    if args.differ:
+        number, shares = _shares(rng, effect)
     recordings = []
-    for _ in range(number):
+    for share in shares:
         u = _command(rng, robot, motion, seconds, every_rows * step)
-        q, v = _moved(robot, option, u, every_rows, (effect, j, size))
+        q, v = _moved(robot, option, u, every_rows, Hidden(effect, j, share * size))
         if q is None:
             return None
         sizes = np.where(robot.slides, 0.16, 1.0)  # a joint that slides has .08 m where others have .5 rad
         read = q + (sizes * noise * rng.standard_normal(q.shape) if not counts else 0.0)
         if effect == "encoder_offset":
-            read[:, j] += 0.02 * size * sizes[j]
+            read[:, j] += 0.02 * share * size * sizes[j]
         if counts:
             resolution = sizes * 2 * np.pi / counts
             read = np.round(read / resolution) * resolution
@@ -163,18 +195,30 @@ def drawn(rng: np.random.Generator, args: argparse.Namespace) -> Case | None:
     joints = [robot.names[k] for k in order]
     task: dict[str, Any] = {"robot": {"model": "robot.xml", "joints": joints}, "data": entries}
     task["actuator"] = {"gains": "known" if known else "free"} | robot.stated
-    at = {"payload": f"body{n - 1}", "gravity_tilt": ""}.get(effect, robot.names[j])
+    whole = {"payload": f"body{n - 1}"} | dict.fromkeys(("gravity_tilt", "late_recorder", *BY_AND_BY), "")
+    at = whole.get(effect, robot.names[j])
     place = f" at {at}" if at and effect != "nothing" else ""
     reading = f"{counts} counts" if counts else f"noise {1e3 * noise:g} mrad"
     told = (
-        f"{effect}{place} x{size:g}, {robot.told}, {option}, every {every_rows} steps, {number} of {seconds:g} s,"
+        f"{effect}{place} x{size:g}{f' of which {shares}' if args.differ else ''}, {robot.told}, {option},"
+        f" every {every_rows} steps, {number} of {seconds:g} s,"
         f" {motion}, {reading}, gains {'known' if known else 'free'}"
         f"{', columns ' + ' '.join(joints) if (order != np.arange(n)).any() else ''}"
         f"{', holdout' if 'role' in entries[-1] else ''}{f', from {start:g} s' if start else ''}"
         f"{', velocity' if with_speed else ''}"
     )
     file = robot.file.replace("<option", f"<option {option}")
-    return Case(told, task, file, recordings, (effect, at) if effect != "nothing" else None, robot.numbers)
+    truth = (effect, at) if effect != "nothing" else None
+    return Case(told, task, file, recordings, truth, robot.numbers, args.differ)
+
+
+def _shares(rng: np.random.Generator, effect: str) -> tuple[int, np.ndarray]:
+    """Number of recordings, and how much of the effect each has: some of them all, others none; or more and more."""
+    number = int(rng.integers(2, 5))
+    if effect in BY_AND_BY:
+        return number, np.round(np.linspace(0.0, 1.0, number), 2)
+    odd = int(rng.integers(1, number))
+    return number, rng.permutation(np.arange(number) < odd).astype(float)
 
 
 def _robot(rng: np.random.Generator, most: int, kinds: list[str]) -> Robot:
@@ -290,15 +334,15 @@ def _command(rng: np.random.Generator, robot: Robot, motion: str, seconds: float
     return robot.ranges * moved * np.clip(t / 0.5, 0, 1)
 
 
-def _moved(
-    robot: Robot, option: str, u: np.ndarray, rows: int, hidden: tuple[str, int, float]
-) -> tuple[np.ndarray | None, np.ndarray]:
+def _moved(robot: Robot, option: str, u: np.ndarray, rows: int, hidden: Hidden) -> tuple[np.ndarray | None, np.ndarray]:
     """Positions and velocities at the command's rows; None where the loop is not stable."""
     model = MADE.MjModel.from_xml_string(robot.text.replace("<option", f"<option {option}"))
     effect, j, size = hidden
     step, dofs = model.opt.timestep, [int(model.joint(name).dofadr[0]) for name in robot.names]
     if effect == "payload":
         _loaded(model, 0.08 * size)
+    if effect in ("actuator_gain", *BY_AND_BY):
+        _worn(model, hidden)
     if effect == "gravity_tilt":
         model.opt.gravity[:] = tilted(model.opt.gravity.copy(), 0.03 * size)
     data = MADE.MjData(model)
@@ -307,7 +351,8 @@ def _moved(
     start = data.qpos[dofs].copy()
     u[:] = start + u
     data.qpos[dofs] = u[0]
-    late = round(0.01 * size / step) if effect == "command_delay" else 0
+    late = round(0.01 * size / step) if effect in ("command_delay", "late_recorder") else 0
+    later = slice(None) if effect == "late_recorder" else slice(j, j + 1)
     q, v = np.zeros_like(u), np.zeros_like(u)
     held = np.repeat(u, rows, 0)
     friction = robot.friction
@@ -317,7 +362,7 @@ def _moved(
             q[k // rows], v[k // rows] = now, rate
         wanted = held[k].copy()
         if late:
-            wanted[j] = held[max(k - late, 0), j]
+            wanted[later] = held[max(k - late, 0), later]
         if effect == "dead_band":
             band = 0.006 * size * robot.ranges[j] / 0.5
             error = wanted[j] - now[j]
@@ -342,6 +387,21 @@ def _moved(
             return None, v
     u *= gears
     return q, v
+
+
+def _worn(model: Any, hidden: Hidden) -> None:
+    """A drive with another gain, drives on a battery that has drained, or joints that have grown warm, in a model."""
+    effect, j, size = hidden
+    if effect == "warming":  # grease
+        model.dof_damping[:] *= 1 - 0.25 * size
+        model.dof_frictionloss[:] *= 1 - 0.15 * size
+        return
+    drives = slice(None) if effect == "battery" else int(model.actuator(f"m{j}").id)
+    factor = 1 - 0.1 * size if effect == "battery" else 1 + 0.15 * size
+    model.actuator_gainprm[drives] *= factor
+    model.actuator_biasprm[drives] *= factor
+    if effect == "battery":
+        model.actuator_forcerange[:] *= factor
 
 
 def _loaded(model: Any, mass: float) -> None:
@@ -490,7 +550,28 @@ def asked(folder: Path, jobs: list[str], judged: Callable[[str], tuple[str, str]
 
 
 def _diagnosed(case: Case, out: Path) -> tuple[str, str]:
-    return diagnosed(out, lambda name: _same(name, case.truth))
+    if not case.differs:
+        return diagnosed(out, lambda name: _same(name, case.truth))
+    mark, line = diagnosed(out, lambda name: _may_be_named(name, case))
+    left = _left(out, case)
+    return ("blind" if mark == "nothing" and left > BLIND else mark), f"{line}; the most that is left {left:.3g}"
+
+
+def _may_be_named(name: tuple[str, str], case: Case) -> bool:
+    """Whether a name is that of what differs, where it is; a load at any link, what all drives have at any joint."""
+    if case.truth is None:
+        return False
+    effect, at = case.truth
+    return name[0] in DIFFERING[effect] and (name[1] == at or not at or effect == "payload")
+
+
+def _left(out: Path, case: Case) -> float:
+    """The largest error that the model leaves at a joint, of the fit or of a recording kept out, over the noise."""
+    error = json.loads((out / "answer.json").read_text())["residual"]
+    noise, told = np.array(error["noise"]), np.load(out / "predictions.npz")
+    held = [(told[key], case.recordings[int(key[3])]["q"]) for key in told.files if key.endswith("_position")]
+    kept_out = [np.sqrt(((model - read) ** 2).mean(0)) for model, read in held]
+    return float(max((one / noise).max() for one in [np.array(error["after"]), *kept_out]))
 
 
 def diagnosed(out: Path, same: Callable[[tuple[str, str]], bool]) -> tuple[str, str]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from argparse import Namespace
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -50,11 +51,33 @@ DRIVES = ("position", "position", "limited", "geared", "general", "stated")
     ],
 )
 def test_a_strangers_rollout_gets_its_cause(seed: int, most: int, effects: list[str], drives: list[str], mark: str):
-    args = Namespace(effects=effects, most=most, drives=list(drives), integrators=["implicitfast", "Euler"])
-    case = drawn(np.random.default_rng([seed, 77]), args)
+    case = drawn(np.random.default_rng([seed, 77]), _asked(effects, most, drives, differ=False))
     assert case is not None
     marks, lines = answered(case, ["diagnose"])
     assert marks == [mark], (case.told, lines)
+
+
+@pytest.mark.parametrize(
+    ("seed", "of"),
+    [
+        pytest.param(5, "encoder_offset", id="another zero"),
+        pytest.param(12, "battery", id="a battery that has drained"),
+        pytest.param(1, "encoder_offset", id="a zero that all others have"),
+    ],
+)
+def test_a_recording_kept_out_of_another_robot_is_no_agreement(seed: int, of: str):
+    """Noise alone is left of the recordings that are fitted; the last one, kept out, has more or less of an effect."""
+    drives = ("position", "limited", "geared", "general")
+    case = drawn(np.random.default_rng([seed, 77]), _asked([], 2, drives, differ=True))
+    assert case is not None and case.told.startswith(of) and case.task["data"][-1]["role"] == "holdout"
+    marks, lines = answered(case, ["diagnose"])
+    assert marks == ["unknown"], (case.told, lines)
+
+
+def _asked(effects: list[str], most: int, drives: Sequence[str], *, differ: bool) -> Namespace:
+    return Namespace(
+        effects=effects, most=most, drives=list(drives), integrators=["implicitfast", "Euler"], differ=differ
+    )
 
 
 def test_a_counter_that_stands_tells_one_reading():

@@ -75,3 +75,4 @@ class Search:
     doubtful: list[tuple[Name, float, str]] = field(default_factory=list)  # of no sure size, left out, with their gain
     creeps: list[Named] = field(default_factory=list)  # friction that holds where the file's creeps
     beside: Fit | None = None  # where a cause that is too slight to be named is left out: with it noise alone is left
+    odd: tuple[str, ...] = ()  # recordings kept out that no numbers explain beside those that were fitted

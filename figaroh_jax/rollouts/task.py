@@ -30,6 +30,7 @@ from .data import Run, Stretch, as_recorded, noise_of, regular, windows, without
 from .faults import refuse_other_order, refuse_other_units
 from .fit import Fit
 from .found import Named, Search
+from .kept_out import largest_of, odd_note, odd_recordings
 from .loop import Loop, alike, brought_back, turns
 from .own import left_out
 from .parameters import put, unit_of, values
@@ -101,6 +102,7 @@ def diagnose_rollout_task(
         found = _with_gains_free(task, loop, runs, seek, found, progress)
         progress("measuring the gain", 0.9)
         here = found.setting or here
+        found = odd_recordings(here, found, [run for run in runs if run.holdout])
         notes = (*notes, *(one.text(loop, here.runs) for one in found.faults))
         return _answer(task, here, runs, found, notes)
 
@@ -190,17 +192,20 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
     scale = here.noise[0]
     before, after = (_rms(s, f, scale) for s, f in ((first, found.first), (found.structure, found.last)))
     wanted = task.diagnose.tolerance
-    if "position" in wanted.model_fields_set and (before <= wanted.position).all():  # good enough, as the task says
-        found.verdict, found.named, found.proxy = "nothing", [], []
+    start, rows = put(here.loop, here.known.table, found.first.theta), judged_rows(here)
+    plain = {run.name: simulated(start, run, rows) for run in runs if run.holdout}
+    most = largest_of(before, found, runs, plain)
+    if "position" in wanted.model_fields_set and (most <= wanted.position).all():  # good enough, as the task says
+        found.verdict, found.named, found.proxy, found.odd = "nothing", [], [], ()
     named = found.verdict in ("named", "named+rest")
     last = (found.structure, found.last) if named else (first, found.first)
     final = put(last[0].loop, last[0].table, last[1].theta)
-    start = put(here.loop, here.known.table, found.first.theta)
-    rows = judged_rows(here)
-    held = {run.name: (simulated(start, run, rows), simulated(final, run, rows)) for run in runs if run.holdout}
+    held = {run.name: (plain[run.name], simulated(final, run, rows)) for run in runs if run.holdout}
     gain = _gain(held, runs, found)
     model = extended_of(rigid(final))
     traces = _traces(here, runs, first, found, last, held)
+    left = largest_of(after if named else before, found, runs, {name: both[1] for name, both in held.items()})
+    shown = [replace(one, role="fit") for one in traces] if found.odd else traces
     refitted = _refitted(here, found if named else None, last)
     creeps = creep_notes(here, found) if named else {}
     told = creeps | body_notes(here, found) if named else {}
@@ -221,11 +226,12 @@ def _answer(task: Task, here: Setting, runs: Sequence[Run], found: Search, notes
         traces=traces,
         baseline=extended_of(start),
         model=model,
-        rest=_rest(found, before if not named else after, here.spread, loop, traces),
+        rest=_rest(found, left, here.spread, loop, shown),
         notes=(
             *notes,
             *_kinds_note(loop, gain),
             *colour_notes(here),
+            *odd_note(found),
             *(judged_note(here) if held else ()),
             *(f"{name}: {text}" for name, text in told.items()),
             *(_open_sizes(found) if named else ()),
