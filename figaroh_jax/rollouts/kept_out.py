@@ -8,30 +8,39 @@ what no such numbers explain differs from recording to recording.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
 
 from ..results import Name
-from .data import Run, Stretch, noise_of
+from .data import Run, Stretch, noise_of, told_by
 from .fit import Fit, fit
 from .found import Search
+from .loop import Loop
+from .parameters import put
 from .screening import LATE, ROUGH, excess_of
-from .setting import Setting, Structure, by_readings, residuals
+from .setting import Setting, Structure, by_readings, excess, residuals
 
 __all__ = ["largest_of", "odd_note", "odd_recordings", "with_kept_out"]
 
 _FIRST = 4  # iterations of the states at the starts of the windows
 
 
-def odd_recordings(here: Setting, found: Search, kept_out: Sequence[Run]) -> Search:
+def odd_recordings(
+    here: Setting, found: Search, kept_out: Sequence[Run], simulated: Callable[[Loop, Run], np.ndarray]
+) -> Search:
     """A search that left noise alone, as a rest where recordings that were kept out show more with any numbers.
 
     A cause stays named that lowers the error of each of them; another one is not the same in all recordings.
+    `simulated` gives what the encoders of a loop read, (rows, joints): where noise alone is between that and the
+    recordings, nothing is fitted.
     """
     if found.verdict not in ("nothing", "named") or not kept_out or not np.isfinite(found.last.cost):
+        return found
+    loop = put(found.structure.loop, found.structure.table, found.last.theta)
+    if here.pole is None and all(_is_noise(here, run, simulated(loop, run)) for run in kept_out):
         return found
     every = with_kept_out(by_readings(here, found.last) or here, kept_out)
     structure = found.structure._replace(data=every.cut(found.structure.loop))
@@ -81,13 +90,22 @@ def largest_of(left: np.ndarray, found: Search, runs: Sequence[Run], held: dict[
     return np.max([left, *(np.sqrt(((run.position - held[run.name]) ** 2).mean(0)) for run in odd)], axis=0)
 
 
+def _is_noise(here: Setting, run: Run, read: np.ndarray) -> bool:
+    """Whether noise alone is between a recording and what is predicted of it, joint by joint."""
+    level, share = np.maximum(noise_of(run.position), here.spread), told_by(run.position)
+    error = (run.position - read) / level * np.sqrt(share)
+    return all(excess(error[:, [k], None], share[:, [k], None]) < 1.0 for k in range(error.shape[1]))
+
+
 def with_kept_out(here: Setting, kept_out: Sequence[Run]) -> Setting:
     """The setting with recordings that were kept out, in windows as long; positions alone, each with its own noise."""
     count, rows = len(here.loop.measured), max(one.rows for one in here.stretches)
     stretches, even = list(here.stretches), np.ones((len(here.runs) + len(kept_out), count))
     for k, run in enumerate(kept_out, len(here.runs)):
         total = len(run.time)
-        stretches += [Stretch(k, first, min(rows, total - first)) for first in range(0, total - rows // 5, rows)]
+        stretches += [
+            Stretch(k, first, min(rows, total - first)) for first in range(0, max(total - rows // 5, 1), rows)
+        ]
         even[k] = here.spread / np.maximum(noise_of(run.position), here.spread)
     runs = (*here.runs, *(run._replace(holdout=False) for run in kept_out))
     pole = None if here.pole is None else here.pole[:count]

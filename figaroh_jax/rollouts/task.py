@@ -102,7 +102,8 @@ def diagnose_rollout_task(
         found = _with_gains_free(task, loop, runs, seek, found, progress)
         progress("measuring the gain", 0.9)
         here = found.setting or here
-        found = odd_recordings(here, found, [run for run in runs if run.holdout])
+        kept_out, rows = [run for run in runs if run.holdout], judged_rows(here)
+        found = odd_recordings(here, found, kept_out, lambda loop, run: simulated(loop, run, rows))
         notes = (*notes, *(one.text(loop, here.runs) for one in found.faults))
         return _answer(task, here, runs, found, notes)
 
