@@ -15,6 +15,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import rollout_conditions
 from benchmarks.rollout_conditions import answered, drawn
 from figaroh_jax.rollouts.data import noise_of, told_by
 from figaroh_jax.rollouts.setting import excess
@@ -72,6 +73,15 @@ def test_a_recording_kept_out_of_another_robot_is_no_agreement(seed: int, of: st
     assert case is not None and case.told.startswith(of) and case.task["data"][-1]["role"] == "holdout"
     marks, lines = answered(case, ["diagnose"])
     assert marks == ["unknown"], (case.told, lines)
+
+
+def test_a_cause_that_predicts_another_robot_better_stays_named(monkeypatch: pytest.MonkeyPatch):
+    """A recording kept out has twice the delay: with the delay of the others it is predicted better, not well."""
+    monkeypatch.setattr(rollout_conditions, "_shares", lambda rng, effect: (2, np.array([1.0, 2.0])))
+    case = drawn(np.random.default_rng([301, 77]), _asked(["command_delay"], 1, ["position", "general"], differ=True))
+    assert case is not None and case.task["data"][-1]["role"] == "holdout"
+    marks, lines = answered(case, ["diagnose"])
+    assert marks == ["right"] and "named+rest, command_delay j0" in lines[0], (case.told, lines)
 
 
 def _asked(effects: list[str], most: int, drives: Sequence[str], *, differ: bool) -> Namespace:
