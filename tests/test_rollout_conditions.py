@@ -39,6 +39,9 @@ DRIVES = ("position", "position", "limited", "geared", "general", "stated")
         ),
         pytest.param(30052, 3, [], DRIVES, "right", id="a tilt behind a drive that saturates"),
         pytest.param(32002, 3, ["nothing"], ("limited",), "nothing", id="drives that saturate", marks=pytest.mark.slow),
+        pytest.param(
+            70007, 3, [], ("position", "limited", "geared", "general"), "right", id="a zero for a weak spring"
+        ),
         pytest.param(40210, 4, [], DRIVES, "nothing", id="a baseline that ends early", marks=pytest.mark.slow),
         pytest.param(
             41206, 4, [], DRIVES, "right", id="a tilt that shows along the joint's axis too", marks=pytest.mark.slow

@@ -44,6 +44,7 @@ from .thresholds import (
     GAIN,
     GAIN_BESIDE_REST,
     NEAR,
+    NO_CHOICE,
     NO_WORSE,
     SLIGHT,
     SURE_OF_NOISE,
@@ -480,16 +481,31 @@ def _best(
                 or tried[simple].sse.sum() <= NO_WORSE * tried[k].sse.sum()
             ):
                 k = simple
+    k = _with_fewest_numbers(tried, passing, k)
     best = tried[k]
     alike = []
     for other in passing:
         contained = tried[other].candidate.kind.holds(best.candidate.effect)
         noise = tried[other].state.excess < 1.0 or best.state.excess >= 1.0
         near = tried[other].sse.sum() - best.sse.sum() < NEAR * (before.sum() - best.sse.sum())
-        if other != k and not contained and noise and near and t_of(tried[other].sse, best.sse) < UNTOLD:
+        untold = t_of(tried[other].sse, best.sse) < UNTOLD or _no_choice(tried[other], best)
+        if other != k and not contained and noise and near and untold:
             alike.append(Name(tried[other].candidate.effect, tried[other].candidate.at))
     named = Named(best.candidate, ts[k], float(gains[k]), tuple(alike), _rms(here, before), _rms(here, best.sse))
     return (named, best.state), p
+
+
+def _no_choice(one: Tried, other: Tried) -> bool:
+    """Whether two causes leave noise alone, and so little between them that neither is the likelier one."""
+    noise = one.state.excess < 1.0 and other.state.excess < 1.0
+    return noise and abs(one.state.fit.squares - other.state.fit.squares) < NO_CHOICE
+
+
+def _with_fewest_numbers(tried: Sequence[Tried], passing: Sequence[int], k: int) -> int:
+    """Of the causes that are as likely as the best one, that with fewer numbers: each more fits some of the noise."""
+    count = [len(one.candidate.entries) for one in tried]
+    fewer = [j for j in passing if count[j] < count[k] and _no_choice(tried[j], tried[k])]
+    return min(fewer, key=lambda j: (count[j], tried[j].state.fit.squares), default=k)
 
 
 def leading(gains: Sequence[float]) -> list[int]:
