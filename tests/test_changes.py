@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from generators import Case, make_case
+from generators import Case, available, make_case
 from generators.inverse import shares_of
 from generators.scoring import judge, table
 from synthetic import DT, made_signals, swing
@@ -124,6 +124,15 @@ def test_a_tool_in_half_of_the_recordings_is_not_nothing(seed: int):
     assert shares_of(case, "part", 4, 1).sum() == 2
     found = answer(case)
     assert found.verdict == "unknown" and "was not the same in all" in found.rest.text, found.rest
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not available("panda"), reason="the Panda's model is not on this machine")
+def test_a_body_of_which_recordings_have_more_or_less_may_be_at_the_next_link():
+    """What one size for all leaves goes with the body: the link before took more of it, with confidence 1."""
+    case = make_case([("payload", 0.1)], robot="panda", repeats=2, trajectories=3, seed=180530, differs="size")
+    score = judge("payload", case.truth, answer(case))
+    assert score.grade in ("right", "set") and not score.false, table([score])
 
 
 @pytest.mark.slow

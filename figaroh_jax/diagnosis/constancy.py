@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..estimation.rows import block_sums, model_sums
+from ..results import Name
 from .estimates import amplitude_places
 from .flexible import dependences
 from .holdout import residual_rms
@@ -22,6 +23,7 @@ from .step import Step
 __all__ = ["of_one_recording", "recordings_that_differ", "shares_by_recording", "still_changed"]
 
 CHANGES = 0.5  # of a cause's size: recordings that differ by less are said to have the same
+UNLIKE = 0.1  # of a body's size: by as much it differs in recordings that may show it at another link than its own
 KEPT = 1e-12  # of the diagonal: a ridge for numbers that no row shows
 MOST_TOLD = 8  # recordings: of more, those with the least and the most
 NONE = 0.2  # of its size: a recording that surely has less of it has none to speak of
@@ -29,23 +31,42 @@ RIDGE = 1e-4  # of a column's squares, of those that a recording alone is fitted
 SURE = 4.0  # standard deviations by which they differ
 
 
-def recordings_that_differ(problem: Problem, joint: Joint, causes: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Notes on the `causes` of an answer that its recordings, `names`, do not have alike."""
-    out = []
+def recordings_that_differ(
+    problem: Problem, joint: Joint, causes: Sequence[str], names: Sequence[str]
+) -> tuple[list[str], dict[int, tuple[Name, ...]]]:
+    """Notes on the `causes` of an answer that its recordings, `names`, do not have alike; and, of bodies of which that
+    is sure however small it is, by their number, the same at the links next to theirs.
+
+    One size for all recordings leaves a rest that goes with the body itself: at another link, more of it may be taken.
+    """
+    out, elsewhere = [], {}
     for k, cause in enumerate(causes):
         share, deviation, which = shares_by_recording(problem, joint, k)
         if len(share) < 2:
             continue
         low, high = int(np.argmin(share + deviation)), int(np.argmax(share - deviation))
         apart = share[high] - share[low]
-        if apart > CHANGES and apart > SURE * np.hypot(deviation[low], deviation[high]):
+        if apart <= SURE * np.hypot(deviation[low], deviation[high]):
+            continue
+        effect = joint.causes[k]
+        if apart > UNLIKE and effect.inertial:
+            elsewhere[k] = tuple(
+                Name(effect.name, (link,)) for link in _next_links(problem, int(np.ravel(effect.at)[0]))
+            )
+        if apart > CHANGES:
             order = [int(k) for k in np.argsort(share)]
             shown = order if len(order) <= MOST_TOLD else [*order[: MOST_TOLD // 2], *order[-MOST_TOLD // 2 :]]
             told = ", ".join(f"{share[r]:.2f} +- {1.96 * deviation[r]:.2f} in {names[which[r]]}" for r in shown)
             absent = share[low] + 1.96 * deviation[low] < NONE
             what = "only some recordings have it" if absent else "some recordings have more of it than others"
             out.append(f"{cause} is told as one size for all recordings, but {what}. Of that size there is {told}")
-    return out
+    return out, elsewhere
+
+
+def _next_links(problem: Problem, link: int) -> list[str]:
+    """The links that a joint connects to a link."""
+    joints, names = problem.model.joints, problem.model.link_names
+    return [names[k] for k, joint in enumerate(joints) if k == joints[link].parent or joint.parent == link]
 
 
 def shares_by_recording(

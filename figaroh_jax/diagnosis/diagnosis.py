@@ -338,6 +338,7 @@ def _answer(
     found = [named[k] for k in order]
     causes = [joint.causes[k] for k in order]
     noise = noise_rms(problem, here.spectrum)
+    differ, elsewhere = recordings_that_differ(problem, joint, [str(f.name) for f in named], [s.name for s in signals])
     return Diagnosis(
         verdict=judged.word,
         causes=tuple(
@@ -346,7 +347,7 @@ def _answer(
                 estimates(effect, joint.fitted, joint.fitted.places[k], model),
                 one.confidence,
                 gain,
-                tuple(dict.fromkeys(Name(*n) for n in one.ambiguous if tuple(n) != tuple(one.name))),
+                _set_of(one, elsewhere.get(k, ())),
                 k + 1,
             )
             for k, one, effect, gain in zip(order, found, causes, gains, strict=True)
@@ -369,12 +370,17 @@ def _answer(
         links=moved_links(problem, first, last, here.whitening, welded),
         notes=(
             *_notes(signals, here, last),
-            *recordings_that_differ(problem, joint, [str(f.name) for f in named], [s.name for s in signals]),
+            *differ,
             *([_LINKS_HELD] if judged.causes.links_held else []),
             *([_AT_REST] if judged.sticks else []),
         ),
         prismatic=prismatic(model),
     )
+
+
+def _set_of(one: Found, more: Sequence[Name]) -> tuple[Name, ...]:
+    """What cannot be told from a cause."""
+    return tuple(dict.fromkeys(Name(*n) for n in (*one.ambiguous, *more) if tuple(n) != tuple(one.name)))
 
 
 def _told(near: Nearest) -> Nearest:
