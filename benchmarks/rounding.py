@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import figaroh_jax as fj
-from figaroh_jax.diagnosis import diagnosis, floor
+from figaroh_jax.diagnosis import causes, floor
 from figaroh_jax.recordings import stacked
 
 FILTERS = ("filter_rows", "filtered_rows", "open_rows")
@@ -51,16 +51,16 @@ def scored(task: str, rounding: float) -> list[list[tuple[str, float]]]:
     modules = [m for name, m in sys.modules.items() if name.startswith("figaroh_jax")]
     held = [(m, name, getattr(stacked, name)) for m in modules for name in FILTERS]
     held = [(m, name, old) for m, name, old in held if getattr(m, name, None) is old]
-    search = diagnosis.find_causes
+    search = causes.find_causes
     try:
-        floor.screen, diagnosis.find_causes = screened, ended
+        floor.screen, causes.find_causes = screened, ended
         for module, name, old in held:
             setattr(module, name, noisy(old) if rounding else old)
         fj.diagnose_task(fj.load_task(task))
     except _Estimated:
         pass
     finally:
-        floor.screen, diagnosis.find_causes = plain, search
+        floor.screen, causes.find_causes = plain, search
         for module, name, old in held:
             setattr(module, name, old)
     return out

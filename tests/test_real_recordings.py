@@ -75,10 +75,10 @@ def test_every_cause_that_the_search_found_is_named_or_told_with_the_reason_why_
 ) -> None:
     """A double pendulum, of which a scale of an encoder is found first and made needless by what comes in behind it."""
     from benchmarks.hide_in_real.recordings import SETS as REAL
-    from figaroh_jax.diagnosis import diagnosis
+    from figaroh_jax.diagnosis import causes
 
-    found_by, find = [], diagnosis.find_causes
-    monkeypatch.setattr(diagnosis, "find_causes", lambda *a, **more: found_by.append(find(*a, **more)) or found_by[-1])
+    found_by, find = [], causes.find_causes
+    monkeypatch.setattr(causes, "find_causes", lambda *a, **more: found_by.append(find(*a, **more)) or found_by[-1])
     cases, run = tmp_path / "cases", tmp_path / "run"
     run.mkdir()
     task = load_task(blackbox.write_task(cases, run, twin_of(cases, REAL["dfki_double_pendulum"]())))
