@@ -27,6 +27,7 @@ UNLIKE = 0.1  # of a body's size: by as much it differs in recordings that may s
 KEPT = 1e-12  # of the diagonal: a ridge for numbers that no row shows
 MOST_TOLD = 8  # recordings: of more, those with the least and the most
 NONE = 0.2  # of its size: a recording that surely has less of it has none to speak of
+OF_ONE = 0.25  # of the squares left in a recording: links and friction of its own foretell that of no noise (.11 is)
 RIDGE = 1e-4  # of a column's squares, of those that a recording alone is fitted with
 SURE = 4.0  # standard deviations by which they differ
 
@@ -141,7 +142,7 @@ def still_changed(problem: Problem, step: Step, tolerance: float) -> Follows | N
 
 
 def of_one_recording(problem: Problem, step: Step, tolerance: float) -> Follows | None:
-    """The joint of which a recording by itself explains most of what a fit of all leaves there; None without.
+    """The joint of which some recording by itself foretells a part of what a fit of all leaves there; None without.
 
     What passes for noise, where no repeats tell it, may be a tool that only some recordings carry or friction that was
     another one: links at the end of the robot, friction and rotors fitted to some slices of a recording then foretell
@@ -154,26 +155,26 @@ def of_one_recording(problem: Problem, step: Step, tolerance: float) -> Follows 
     scale = np.maximum(residual_rms(problem, step.state), 1e-9 * max(float(size.max()), 1e-300))[:, None]
     residual = (rows.y - rows.X @ step.state.theta) / scale
     columns = rows.X.dense()[..., _of_ends(problem, step.state)] / scale[..., None]
-    all_of_it, left = np.zeros((2, len(size)))
-    for used in recordings:
+    share, followed, noise = np.zeros((3, len(recordings), len(size)))
+    for k, used in enumerate(recordings):
         there = rows.y[:, used] != 0
         e = residual[:, used] * there
         e -= there * (e.sum(1) / np.maximum(there.sum(1), 1))[:, None]
         foretold = _foretold_together(e, columns[:, used] * there[..., None], rows.block[used] % FOLDS)
-        all_of_it += (e**2).sum(1)
-        left += ((e - foretold) ** 2).sum(1)
-    count = np.maximum((rows.y != 0).sum(1), 1)
-    followed = scale[:, 0] * np.sqrt(np.maximum(all_of_it - left, 0.0) / count) / np.maximum(size, 1e-300)
-    surely = (left < (1 - CHANGED_SQUARES) * all_of_it) & (followed > tolerance) & (size > 0)
-    if not surely.any():
+        all_of_it, left = ((one**2).sum(1) / np.maximum(there.sum(1), 1) for one in (e, e - foretold))
+        share[k] = 1 - left / np.maximum(all_of_it, 1e-300)
+        followed[k] = scale[:, 0] * np.sqrt(np.maximum(all_of_it - left, 0.0)) / np.maximum(size, 1e-300)
+        noise[k] = scale[:, 0] * np.sqrt(left)
+    followed = np.where((share > OF_ONE) & (size > 0), followed, 0.0)
+    k, joint = np.unravel_index(int(np.argmax(followed)), followed.shape)
+    if followed[k, joint] <= tolerance:
         return None
-    joint = int(np.argmax(np.where(surely, followed, 0.0)))
     most = np.full(len(size), np.inf)
-    most[joint] = scale[joint, 0] * np.sqrt(left[joint] / count[joint])
+    most[joint] = noise[k, joint]
     text = (
-        f"most of what {problem.model.dof_names[joint]} leaves ({followed[joint]:.2g} of its torque) goes with links"
-        " and friction that each recording has for itself: the robot, its load or its temperature was not the same in"
-        " all"
+        f"{100 * share[k, joint]:.2g} % of what {problem.model.dof_names[joint]} leaves in one of the recordings"
+        f" ({followed[k, joint]:.2g} of its torque) goes with links and friction that this recording has for itself:"
+        " the robot, its load or its temperature was not the same in all"
     )
     return Follows(text, most)
 
