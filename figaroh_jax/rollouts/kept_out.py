@@ -76,11 +76,11 @@ def odd_note(found: Search) -> tuple[str, ...]:
     """What recordings that were kept out say against the model, and what to do."""
     if not found.odd:
         return ()
-    names, are = ", ".join(found.odd), "is" if len(found.odd) == 1 else "are"
+    names = ", ".join(found.odd)
     return (
-        f"{names}, kept out, {are} not explained, with any of its numbers, by what leaves noise alone of the others:"
-        " something is not the same in all recordings, such as a load, a zero, a gain, the base's level, warm joints or"
-        f" a battery. Without `role: holdout` the cause in {names} is looked for, too",
+        f"the model that leaves noise alone of the other recordings does not explain {names}, kept out, whatever its"
+        " numbers are: something is not the same in all recordings, such as a load, a zero, a gain, the base's level,"
+        f" warm joints or a battery. Without `role: holdout` a cause is looked for in {names} too",
     )
 
 
