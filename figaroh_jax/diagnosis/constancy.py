@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..estimation.joint_rows import JointRows
 from ..estimation.rows import block_sums, model_sums
 from ..results import Name
 from .estimates import amplitude_places
@@ -17,7 +18,7 @@ from .layout import FOLDS
 from .problem import Problem
 from .repeats import CHANGED_SQUARES, foretold_by_others
 from .rest import Follows, rows_at
-from .state import State, plain_rows
+from .state import plain_rows
 from .step import Step
 
 __all__ = ["of_one_recording", "recordings_that_differ", "shares_by_recording", "still_changed"]
@@ -154,7 +155,7 @@ def of_one_recording(problem: Problem, step: Step, tolerance: float) -> Follows 
         return None
     scale = np.maximum(residual_rms(problem, step.state), 1e-9 * max(float(size.max()), 1e-300))[:, None]
     residual = (rows.y - rows.X @ step.state.theta) / scale
-    columns = rows.X.dense()[..., _of_ends(problem, step.state)] / scale[..., None]
+    columns = _of_ends(problem, rows.X) / scale[..., None]
     share, followed, noise = np.zeros((3, len(recordings), len(size)))
     for k, used in enumerate(recordings):
         there = rows.y[:, used] != 0
@@ -179,11 +180,11 @@ def of_one_recording(problem: Problem, step: Step, tolerance: float) -> Follows 
     return Follows(text, most)
 
 
-def _of_ends(problem: Problem, state: State) -> list[int]:
-    """Columns of the links that carry no other, and of all friction and rotors, among those of a state."""
+def _of_ends(problem: Problem, X: JointRows) -> Float[np.ndarray, "nv T k"]:
+    """Columns of the links that carry no other, and of all friction and rotors, of those of a state."""
     joints = problem.model.joints
     ends = [k for k in range(len(joints)) if not any(other.parent == k for other in joints)]
-    return [*(10 * k + i for k in ends for i in range(10)), *range(10 * len(joints), len(state.theta))]
+    return np.concatenate([*(X.dense(10 * k, 10 * k + 10) for k in ends), X.dense(10 * len(joints))], axis=2)
 
 
 def _foretold_together(
