@@ -92,6 +92,7 @@ def test_the_share_that_each_recording_has_of_a_cause_is_told():
     case = make_case([("stribeck_friction", 0.15)], robot="small", repeats=2, trajectories=3, seed=1, differs="repeat")
     found = answer(case)
     assert [(cause.name.effect, cause.name.at) for cause in found.causes] == [("stribeck_friction", case.truth[0].at)]
+    assert found.verdict == "named+rest" and ONE_SIZE in found.rest.text
     told, true = shares_told(found), shares_of(case, "repeat", 3, 2)
     assert any(f"{ONE_SIZE}, but only some recordings have it" in note for note in found.notes)
     size = found.causes[0].parameters["force"].value / case.truth[0].parameters["force"]
@@ -124,6 +125,7 @@ def test_a_tool_in_half_of_the_recordings_is_not_nothing(seed: int):
     assert shares_of(case, "part", 4, 1).sum() == 2
     found = answer(case)
     assert found.verdict == "unknown" and "was not the same in all" in found.rest.text, found.rest
+    assert any(f"leaves in {one['name']} " in found.rest.text for one in case.recordings)
 
 
 @pytest.mark.slow

@@ -111,6 +111,28 @@ def test_a_spring_that_a_recording_kept_out_shows_is_no_slow_noise(data_dir: Pat
 
 
 @pytest.mark.slow
+def test_a_spring_that_the_second_of_two_runs_has_alone_is_no_noise(data_dir: Path, tmp_path: Path) -> None:
+    """A KUKA's two runs of one motion, as they were recorded and with a spring at the third joint in the second."""
+    from benchmarks.hide_in_real.recordings import SETS as REAL
+
+    cases, run = tmp_path / "cases", tmp_path / "run"
+    run.mkdir()
+    path = blackbox.write_task(cases, run, twin_of(cases, REAL["kuka"]()))
+    plain = diagnose_task(load_task(path))
+    (second,) = run.glob("*measurements_2*.npz")
+    with np.load(second) as read:
+        arrays = dict(read)
+    moved, torque = arrays["q"][:, 2] - arrays["q"][:, 2].mean(), arrays["tau"][:, 2]
+    arrays["tau"][:, 2] = torque + np.random.default_rng().uniform(0.15, 0.25) * torque.std() * moved / moved.std()
+    np.savez(second, **arrays)
+    changed = diagnose_task(load_task(path))
+    assert not any("another one" in note for note in plain.notes)
+    assert any("the torque of lwr_2_joint is another one" in note for note in changed.notes), changed.notes
+    assert changed.verdict in ("unknown", "named+rest")
+    assert "the torque of lwr_2_joint is another one" in changed.rest.text
+
+
+@pytest.mark.slow
 def test_a_ripple_of_many_periods_is_found_beside_a_slow_misfit_of_its_joint(data_dir: Path, tmp_path: Path) -> None:
     """A KUKA's last joint, where a ripple so slow that the motion shows no period of it explains more."""
     from benchmarks.hide_in_real.recordings import SETS as REAL

@@ -150,14 +150,14 @@ def of_one_recording(problem: Problem, step: Step, tolerance: float) -> Follows 
     the others. Noise of slices does not, whatever its spectrum is. Constants say nothing, as torque sensors drift.
     """
     rows, size = plain_rows(problem, step.state), np.sqrt(np.mean(problem.torque**2, axis=(0, 1)))
-    recordings = [used for _, used in _fitted(problem, rows.block)]
+    recordings = list(_fitted(problem, rows.block))
     if len(recordings) < 2:
         return None
     scale = np.maximum(residual_rms(problem, step.state), 1e-9 * max(float(size.max()), 1e-300))[:, None]
     residual = (rows.y - rows.X @ step.state.theta) / scale
     columns = _of_ends(problem, rows.X) / scale[..., None]
     share, followed, noise = np.zeros((3, len(recordings), len(size)))
-    for k, used in enumerate(recordings):
+    for k, (_, used) in enumerate(recordings):
         there = rows.y[:, used] != 0
         e = residual[:, used] * there
         e -= there * (e.sum(1) / np.maximum(there.sum(1), 1))[:, None]
@@ -172,8 +172,9 @@ def of_one_recording(problem: Problem, step: Step, tolerance: float) -> Follows 
         return None
     most = np.full(len(size), np.inf)
     most[joint] = noise[k, joint]
+    at, where = problem.model.dof_names[joint], problem.names[recordings[k][0]]
     text = (
-        f"{100 * share[k, joint]:.2g} % of what {problem.model.dof_names[joint]} leaves in one of the recordings"
+        f"{100 * share[k, joint]:.2g} % of what {at} leaves in {where}"
         f" ({followed[k, joint]:.2g} of its torque) goes with links and friction that this recording has for itself:"
         " the robot, its load or its temperature was not the same in all"
     )

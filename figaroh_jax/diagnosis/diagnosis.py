@@ -339,8 +339,9 @@ def _answer(
     causes = [joint.causes[k] for k in order]
     noise = noise_rms(problem, here.spectrum)
     differ, elsewhere = recordings_that_differ(problem, joint, [str(f.name) for f in named], [s.name for s in signals])
+    unlike = judged.word == "named" and bool(differ)  # one size for all leaves what others have more or less
     return Diagnosis(
-        verdict=judged.word,
+        verdict="named+rest" if unlike else judged.word,
         causes=tuple(
             Cause(
                 Name(*one.name),
@@ -366,7 +367,11 @@ def _answer(
         traces=traces(problem, signals, first.state, last.state, joint.causes, named),
         baseline=fitted_model(problem, first.state, []),
         model=fitted_model(problem, last.state, joint.causes),
-        rest=replace(judged.rest, nearest=tuple(map(_told, judged.rest.nearest))),
+        rest=replace(
+            judged.rest,
+            nearest=tuple(map(_told, judged.rest.nearest)),
+            text=differ[0] if unlike else judged.rest.text,
+        ),
         links=moved_links(problem, first, last, here.whitening, welded),
         notes=(
             *_notes(signals, here, last),

@@ -361,6 +361,7 @@ class Problem:
     trust: float
     width: Float[np.ndarray, " nv"]  # half width of the friction's reversal, rad/s or m/s
     held: Float[np.ndarray, "n M nv"]  # 1: a row of a holdout recording with torque
+    names: tuple[str, ...] = ()  # of the recordings
     bounded: bool = False  # whether the links stay within what is believed of them (`believed`)
     filtered: Filtered = field(default_factory=Filtered, compare=False, repr=False)
     # states with the first causes of a fit, and what was said of a fit without one of them

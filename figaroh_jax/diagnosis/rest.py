@@ -347,6 +347,7 @@ def _dependences(problem: Problem, state: State, joint: int) -> list[tuple[Depen
 def rows_at(
     problem: Problem, state: State, columns: Float[np.ndarray, "k nN"], whitening: np.ndarray, joint: int
 ) -> Float[np.ndarray, "k T"]:
+    """Whitened rows, at a joint, of columns that stand at all samples, as sensors that follow all torque read them."""
     n, samples, _, _ = problem.records.shape
     response = (whitening[:, joint] * state.response(problem.records.omega))[None]
     rows = filter_rows(problem.records, columns.reshape(-1, n, samples), response, fitted=True)

@@ -105,7 +105,8 @@ def _begun(backend: Backend, signals: Sequence[Signals], known: Baseline | None,
     records = stack(signals, backend.robot, joined=True)
     records = without_reversals(eqx.tree_at(lambda r: r.weight, records, records.weight + records.standing))
     held = held_rows(signals, records)
-    problem = Problem(backend, records, layout(signals, records), trust, np.zeros(backend.robot.nv), held)
+    names, width = tuple(one.name for one in signals), np.zeros(backend.robot.nv)
+    problem = Problem(backend, records, layout(signals, records), trust, width, held, names)
     return problem, baseline(problem, *stated_effects(backend.robot, known))
 
 
