@@ -21,7 +21,14 @@ from .rest import Follows, rows_at
 from .state import plain_rows
 from .step import Step
 
-__all__ = ["of_one_recording", "recordings_that_differ", "shares_by_recording", "still_changed"]
+__all__ = [
+    "fitted_recordings",
+    "of_one_recording",
+    "recordings_that_differ",
+    "shares_by_recording",
+    "shown_of_many",
+    "still_changed",
+]
 
 CHANGES = 0.5  # of a cause's size: recordings that differ by less are said to have the same
 UNLIKE = 0.1  # of a body's size: by as much it differs in recordings that may show it at another link than its own
@@ -56,13 +63,18 @@ def recordings_that_differ(
                 Name(effect.name, (link,)) for link in _next_links(problem, int(np.ravel(effect.at)[0]))
             )
         if apart > CHANGES:
-            order = [int(k) for k in np.argsort(share)]
-            shown = order if len(order) <= MOST_TOLD else [*order[: MOST_TOLD // 2], *order[-MOST_TOLD // 2 :]]
+            shown = shown_of_many(share)
             told = ", ".join(f"{share[r]:.2f} +- {1.96 * deviation[r]:.2f} in {names[which[r]]}" for r in shown)
             absent = share[low] + 1.96 * deviation[low] < NONE
             what = "only some recordings have it" if absent else "some recordings have more of it than others"
             out.append(f"{cause} is told as one size for all recordings, but {what}. Of that size there is {told}")
     return out, elsewhere
+
+
+def shown_of_many(sizes: Float[np.ndarray, " k"]) -> list[int]:
+    """Which of the sizes are told, from the least to the most; of many those at the ends."""
+    order = [int(k) for k in np.argsort(sizes)]
+    return order if len(order) <= MOST_TOLD else [*order[: MOST_TOLD // 2], *order[-MOST_TOLD // 2 :]]
 
 
 def _next_links(problem: Problem, link: int) -> list[str]:
@@ -85,7 +97,7 @@ def shares_by_recording(
     at = amplitude_places(step.state, joint.causes)[which]
     size = np.zeros_like(theta)
     size[at] = theta[at]
-    torque, recordings = rows.X @ size, list(_fitted(problem, rows.block))
+    torque, recordings = rows.X @ size, list(fitted_recordings(problem, rows.block))
     if not at or not torque.any() or len(recordings) < 2:
         return np.zeros(0), np.zeros(0), np.zeros(0, int)
     own = [np.where(used, torque, 0.0) for _, used in recordings]
@@ -150,7 +162,7 @@ def of_one_recording(problem: Problem, step: Step, tolerance: float) -> Follows 
     the others. Noise of slices does not, whatever its spectrum is. Constants say nothing, as torque sensors drift.
     """
     rows, size = plain_rows(problem, step.state), np.sqrt(np.mean(problem.torque**2, axis=(0, 1)))
-    recordings = list(_fitted(problem, rows.block))
+    recordings = list(fitted_recordings(problem, rows.block))
     if len(recordings) < 2:
         return None
     scale = np.maximum(residual_rms(problem, step.state), 1e-9 * max(float(size.max()), 1e-300))[:, None]
@@ -202,7 +214,7 @@ def _foretold_together(
     return out
 
 
-def _fitted(problem: Problem, block: Int[np.ndarray, " T"]) -> Iterator[tuple[int, Bool[np.ndarray, " T"]]]:
+def fitted_recordings(problem: Problem, block: Int[np.ndarray, " T"]) -> Iterator[tuple[int, Bool[np.ndarray, " T"]]]:
     """Number and rows of each recording that is fitted."""
     n, _, count, _ = problem.records.shape
     for number, at in enumerate(problem.records.spans):

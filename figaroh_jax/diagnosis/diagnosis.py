@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -32,27 +33,30 @@ from ..simulators.registry import backend as make_backend
 from .answer_fit import as_moves, as_predicts_best, as_weighed_in_motion, as_weighed_otherwise, together
 from .believed import impossible_links
 from .causes import UNSURE, searched_causes, told_size
-from .constancy import recordings_that_differ
+from .constancy import of_one_recording, recordings_that_differ
 from .estimates import estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
 from .floor import noise_rms, short, sober_spectrum, undecided
 from .gaining import Gaining, without_losses
-from .holdout import residual_rms, traces
+from .holdout import relative_error, residual_rms, traces
 from .joint import Joint, least_sure, opened, with_rest, without_a_number
 from .judgement import KeptOut, Searched, as_slow_noise, doubted_rest, reasons_against, standings_of, sticks_alone
 from .layout import describe_folds
 from .links import as_gain, moved_links
 from .naming import ONE_PART, lone_part, strong
+from .problem import Problem
 from .reading import Reader, only_read
 from .repeats import repeats_not_said
 from .rest import parts_of, relative_rest, roughly_predictable, tolerated, verdict
 from .screening import OneMore, noise_squares
 from .search import Found, Search, chance_beside
-from .setting import Setting, prepared_signals, setting_beside, setting_of
+from .setting import Setting, begun_with, prepared_signals, setting_beside, setting_of
 from .standstill import resting
+from .state import State
 from .step import Step, stand
 from .thresholds import ALPHA_OF_A_NAME, AS_WELL, LINE_P, REST_P
+from .zeros import EFFECT, Zeros, as_causes, gain_of, shifted, unexplained, zeros_that_differ
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess, Task
@@ -115,11 +119,9 @@ def diagnose(
         backend = as_backend(model)
         refuse_unmeasured(backend.robot, recordings)
         signals, band, begun = prepared_signals(backend, recordings, preprocess, known, trust)
-        here = setting_of(*begun, forbid, progress)
         ordered = sorted(recordings, key=lambda r: r.role == "holdout")
-        reader, generator = Reader(ordered, signals, preprocess, band), np.random.default_rng(seed)
 
-        def answered(here: Setting) -> tuple[Diagnosis, Setting | None]:
+        def answered(here: Setting, reader: Reader, generator: np.random.Generator) -> tuple[_Answered, Setting | None]:
             """The answer, and the setting anew where a cause that was found has passed for noise."""
             give_back_holes()
             searched = searched_causes(here, forbid, ALPHA_OF_A_NAME * alpha, tolerance, progress, generator)
@@ -131,15 +133,57 @@ def diagnose(
             if not contradictions and (cannot_be := _impossible(judged)):
                 judged = _judged(*asked, cannot_be)
             progress("measuring the gain", 0.9)
-            return _answer(searched.here, signals, searched.search, judged, welded), again
+            answer = _answer(searched.here, reader.signals, searched.search, judged, welded)
+            return _Answered(answer, judged.here, judged.causes.joint.step), again
 
-        answer, again = answered(here)
-        if again:
-            other, _ = answered(again)
-            if other.holdout.after <= min(AS_WELL * answer.holdout.after, answer.holdout.before):
-                answer = other
+        def answer_to(signals: Sequence[Signals], begun: tuple[Problem, State]) -> _Answered:
+            reader, generator = Reader(ordered, signals, preprocess, band), np.random.default_rng(seed)
+            one, again = answered(setting_of(*begun, forbid, progress), reader, generator)
+            if again:
+                other, _ = answered(again, reader, generator)
+                held = one.answer.holdout
+                if other.answer.holdout.after <= min(AS_WELL * held.after, held.before):
+                    return other
+            return one
+
+        zeros = () if contradictions else zeros_that_differ(*begun, tolerance)
+        answer = None
+        if zeros and EFFECT not in forbid:
+            moved = shifted(signals, zeros)
+            one = answer_to(moved, begun_with(backend, moved, known, trust))
+            answer = _of_own_zeros(one, zeros, begun[0], [s.name for s in signals], tolerance)
+        if answer is None:
+            answer = answer_to(signals, begun).answer
+            answer = unexplained(answer, zeros, backend.robot.dof_names, [s.name for s in signals])
         cannot_be = [f"impossible: {text}" for text in answer.rest.contradicts if text not in contradictions]
         return replace(answer, band=band, notes=(*cannot_be, *answer.notes, *note_on(band)))
+
+
+class _Answered(NamedTuple):
+    """An answer, and the fit that it is of."""
+
+    answer: Diagnosis
+    here: Setting
+    step: Step
+
+
+def _of_own_zeros(
+    one: _Answered, zeros: Sequence[Zeros], measured: Problem, names: Sequence[str], tolerance: float
+) -> Diagnosis | None:
+    """The answer to recordings that were shifted, with the constants by which they were; None where a rest stays that
+    these may be a part of. `measured` has the torques as they were."""
+    answer, here, step = one
+    problem, joints = here.problem, here.problem.model.dof_names
+    rest = answer.verdict in ("unknown", "named+rest")
+    if rest and not (all(z.certain for z in zeros) and of_one_recording(problem, step, tolerance) is None):
+        return None
+    problem = replace(problem, records=eqx.tree_at(lambda r: r.torque, problem.records, measured.records.torque))
+    first = stand(problem, here.start, here.whitening)
+    gains = [gain_of(here.problem, step, z) for z in zeros]
+    answer = as_causes(answer, zeros, gains, joints, names)
+    held = problem.held.any()  # their constants are not known
+    before = answer.holdout.before if held else relative_error(problem, first)
+    return replace(answer, before=residual_rms(problem, first.state), holdout=replace(answer.holdout, before=before))
 
 
 class _Judged(NamedTuple):

@@ -24,14 +24,14 @@ from .layout import held_rows, layout
 from .problem import Problem
 from .repeats import checked_repeats
 from .state import State, baseline, stated_effects, with_width
-from .step import stand, with_causes
+from .step import Step, stand, with_causes
 from .thresholds import MOST_OF_RESIDUAL, OF_ANOTHER_WIDTH, PASSED_FOR_NOISE, WEIGHT_ROUNDS
 from .weights import weighted_by_speed, white_where_better, without_held, without_reversals
 
 if TYPE_CHECKING:
     from ..formats.config import Baseline, Preprocess
 
-__all__ = ["Setting", "prepared_signals", "setting_beside", "setting_of"]
+__all__ = ["Setting", "begun_with", "prepared_signals", "setting_beside", "setting_of", "weighed_by_residual"]
 
 
 class Setting(NamedTuple):
@@ -77,7 +77,7 @@ def prepared_signals(
         signals = sorted(checked_repeats(prepared, backend.robot.dof_names), key=lambda s: s.role == "holdout")
         if like and like.moves_as(signals):
             return like
-        begun = _begun(backend, signals, known, trust)
+        begun = begun_with(backend, signals, known, trust)
         return _Read(signals, band, begun, _baseline_squares(*begun))
 
     plain = read(None)
@@ -92,15 +92,23 @@ def _baseline_squares(problem: Problem, start: State) -> Float[np.ndarray, " nv"
 
     None is less than 1e-12 of their sum: a joint without error decides nothing.
     """
-    torque = np.sqrt(((problem.torque * problem.records.judged) ** 2).mean((0, 1)))
-    white = np.ones((len(problem.records.omega), 1)) / np.maximum(torque, 1e-9 * torque.max())
-    residual = residual_rms(problem, stand(problem, start, white).state)
-    step = stand(problem, start, white * torque / np.maximum(residual, 1e-9 * residual.max()))
+    step, _ = weighed_by_residual(problem, start)
     squares = fold_squares(problem, step.state, step.verdicts.folds, problem.layout.fold)
     return np.maximum(squares, max(1e-12 * squares.sum(), 1e-300))
 
 
-def _begun(backend: Backend, signals: Sequence[Signals], known: Baseline | None, trust: float) -> tuple[Problem, State]:
+def weighed_by_residual(problem: Problem, start: State) -> tuple[Step, Float[np.ndarray, "F nv"]]:
+    """The baseline of rows that are weighed by what it leaves of their joint, and that weight."""
+    torque = np.sqrt(((problem.torque * problem.records.judged) ** 2).mean((0, 1)))
+    white = np.ones((len(problem.records.omega), 1)) / np.maximum(torque, 1e-9 * torque.max())
+    residual = residual_rms(problem, stand(problem, start, white).state)
+    white = white * torque / np.maximum(residual, 1e-9 * residual.max())
+    return stand(problem, start, white), white
+
+
+def begun_with(
+    backend: Backend, signals: Sequence[Signals], known: Baseline | None, trust: float
+) -> tuple[Problem, State]:
     """The recordings on one clock, and the baseline."""
     records = stack(signals, backend.robot, joined=True)
     records = without_reversals(eqx.tree_at(lambda r: r.weight, records, records.weight + records.standing))
