@@ -170,12 +170,12 @@ class _Answered(NamedTuple):
 def _of_own_zeros(
     one: _Answered, zeros: Sequence[Zeros], measured: Problem, names: Sequence[str], tolerance: float
 ) -> Diagnosis | None:
-    """The answer to recordings that were shifted, with the constants by which they were; None where a rest stays that
-    these may be a part of. `measured` has the torques as they were."""
+    """The answer to recordings that were shifted, with the constants by which they were; None where these may be a part
+    of a rest, or of a load or friction that only some recordings have. `measured` has the torques as they were."""
     answer, here, step = one
     problem, joints = here.problem, here.problem.model.dof_names
     rest = answer.verdict in ("unknown", "named+rest")
-    if rest and not (all(z.certain for z in zeros) and of_one_recording(problem, step, tolerance) is None):
+    if (rest and not all(z.certain for z in zeros)) or of_one_recording(problem, step, tolerance):
         return None
     problem = replace(problem, records=eqx.tree_at(lambda r: r.torque, problem.records, measured.records.torque))
     first = stand(problem, here.start, here.whitening)

@@ -27,7 +27,9 @@ __all__ = ["EFFECT", "Zeros", "as_causes", "gain_of", "shifted", "unexplained", 
 
 SURE_P = 1e-4  # chance that constants of quarters of the recordings differ as much as those of the recordings do
 APART = 25.0  # their squares over those that the quarters foretell: noise as slow as a recording made 10 at most
-FAR_APART = 100.0  # times: a tool or friction that only some recordings have made 50 at most, of a tenth of the torque
+FAR_APART = (
+    1000.0  # times: a tool or friction that only some recordings have, of a fifth of the torque, made 94 at most
+)
 RIDGE = 1e-9  # of the diagonal: columns that no row shows, or that are the same
 EFFECT = "torque_offset"
 
@@ -178,7 +180,8 @@ def unexplained(answer: Diagnosis, zeros: Sequence[Zeros], joints: Sequence[str]
     if not zeros:
         return answer
     notes = [told(one, joints, names) for one in zeros]
-    if answer.verdict == "nothing":
+    beside: dict[Verdict, Verdict] = {"nothing": "unknown", "named": "named+rest"}
+    if answer.verdict in beside:
         rest = replace(answer.rest, text=notes[0], tolerated="", undecided="")
-        answer = replace(answer, verdict="unknown", rest=rest)
+        answer = replace(answer, verdict=beside[answer.verdict], rest=rest)
     return replace(answer, notes=(*answer.notes, *notes))
