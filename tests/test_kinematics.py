@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
@@ -56,9 +57,9 @@ def test_joint_poses_of_tiny_robots_equal_the_reference_backend(name: str, tmp_p
 def test_motion_is_the_time_derivative_of_the_poses(tmp_path: Path) -> None:
     model = robots.load(robots.TREE, tmp_path)
     q, v, a = (jnp.asarray(x.T) for x in robots.states(model, 3))
-    state = kinematics.motion(model, q, v, a)
-    h = 1e-4
-    poses = [kinematics.placements(model, q + v * t + a * t * t / 2) for t in (-h, 0.0, h)]
+    state = eqx.filter_jit(kinematics.motion)(model, q, v, a)
+    h, placed = 1e-4, eqx.filter_jit(kinematics.placements)
+    poses = [placed(model, q + v * t + a * t * t / 2) for t in (-h, 0.0, h)]
     acceleration = np.array((poses[2] - 2 * poses[1] + poses[0])[:, :3] / h**2)
     acceleration[:, :, 3] -= np.asarray(model.gravity)[:, None]
     columns = np.moveaxis(np.roll(acceleration, 1, axis=2), 2, 1)  # origin first
