@@ -257,7 +257,9 @@ def test_browser_keeps_the_names_of_joints_whole_on_a_phone(tab: browser.Page, t
 
 
 @pytest.mark.parametrize(
-    ("size", "dark"), [(LAPTOP, False), (PHONE, False), (LAPTOP, True)], ids=["laptop", "phone", "dark"]
+    ("size", "dark"),
+    [pytest.param(LAPTOP, False, marks=pytest.mark.slow), (PHONE, False), (LAPTOP, True)],
+    ids=["laptop", "phone", "dark"],
 )
 def test_browser_draws_the_plots_of_every_joint(tab: browser.Page, size: tuple[int, int], dark: bool, tmp_path: Path):
     tab.open(_written(VARIANTS["named"], tmp_path), *size, phone=size == PHONE, dark=dark)

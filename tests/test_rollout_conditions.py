@@ -66,7 +66,7 @@ def test_a_strangers_rollout_gets_its_cause(seed: int, most: int, effects: list[
     [
         pytest.param(5, "encoder_offset", id="another zero"),
         pytest.param(12, "battery", id="a battery that has drained"),
-        pytest.param(1, "encoder_offset", id="a zero that all others have"),
+        pytest.param(1, "encoder_offset", id="a zero that all others have", marks=pytest.mark.slow),
     ],
 )
 def test_a_recording_kept_out_of_another_robot_is_no_agreement(seed: int, of: str):
