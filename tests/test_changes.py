@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,14 +73,25 @@ def test_a_torque_that_follows_the_motion_is_a_change_of_its_joint(law: str):
     assert not repeats_not_said(told)  # they are no repeats, whatever their motion
 
 
+@pytest.mark.parametrize("by, told_apart", [(0.06, True), (2 * np.pi, False), (0.0005, False)])
+def test_repeats_that_stand_aside_are_told(by: float, told_apart: bool):
+    """An encoder that was zeroed anew between them; a turn more is the same posture."""
+    first, second = (recorded(0.0, np.zeros((1, 2)), name) for name in ("first", "second"))
+    second = replace(second, position=second.position + np.array([0.0, by]))
+    one = checked_repeats([first, second], ["hip", "knee"])[1]
+    assert (one.repeat is None) == told_apart and not one.changed_since
+    assert ("reads knee +0.06 rad (or m) from there all along" in one.notes[-1]) == told_apart
+    assert not repeats_not_said([first, one])
+
+
 def test_recordings_of_other_motions_are_not_compared():
     first, second = recorded(0.0, np.zeros((1, 2)), "first"), made_signals(SECONDS, other, name="second", repeat="A")
     assert checked_repeats([first, second], ["hip", "knee"])[1].changed_since is None
 
 
-def answer(case: Case) -> Diagnosis:
+def answer(case: Case, forbid: Sequence[str] = ()) -> Diagnosis:
     with tempfile.TemporaryDirectory() as folder:
-        return diagnose_task(config.load_task(case.write(Path(folder))))
+        return diagnose_task(config.load_task(case.write(Path(folder), forbid=forbid)))
 
 
 def shares_told(found: Diagnosis) -> dict[str, tuple[float, float]]:
@@ -126,6 +139,44 @@ def test_a_tool_in_half_of_the_recordings_is_not_nothing(seed: int):
     found = answer(case)
     assert found.verdict == "unknown" and "was not the same in all" in found.rest.text, found.rest
     assert any(f"leaves in {one['name']} " in found.rest.text for one in case.recordings)
+
+
+def constants_told(found: Diagnosis) -> dict[str, tuple[float, float]]:
+    """By recording, of the one joint of which an answer says that they differ."""
+    (note,) = [note for note in found.notes if "has another constant in each recording" in note]
+    number = r"([+-][\d.e-]+) \+- ([\d.e-]+) N m \(or N\) in (\w+)"
+    return {name: (float(value), float(half)) for value, half, name in re.findall(number, note)}
+
+
+@pytest.mark.parametrize(
+    "differs, repeats, trajectories",
+    [("repeat", 2, 3), *(pytest.param(*one, marks=pytest.mark.slow) for one in (("part", 1, 4), ("size", 2, 3)))],
+)
+def test_a_torque_that_was_zeroed_anew_is_named_with_each_constant(differs: str, repeats: int, trajectories: int):
+    """Drawn at run time. Between repeats it passed for noise (`nothing`), else it was `unknown`, or a false spring."""
+    seed = int(np.random.default_rng().integers(1 << 30))
+    asked = {"robot": "small", "repeats": repeats, "trajectories": trajectories, "seed": seed, "differs": differs}
+    case = make_case([("torque_offset", 0.12)], **asked)
+    found, truth = answer(case), case.truth[0]
+    assert found.verdict == "named", (seed, found.rest)
+    assert [(c.name.effect, c.name.at) for c in found.causes] == [("torque_offset", truth.at)], seed
+    each, told = truth.parameters["offset"] * shares_of(case, differs, trajectories, repeats), constants_told(found)
+    values = np.array([told[one["name"]] for one in case.recordings])
+    assert np.all(np.abs(values[:, 0] - (each - each.mean())) < 2 * values[:, 1] + 0.01 * np.ptp(each)), seed
+    assert found.causes[0].parameters["spread"].value == pytest.approx(each.std(), rel=0.05)
+    gain = found.causes[0].gain
+    assert gain.after < gain.before < found.holdout.before and gain.after == pytest.approx(found.holdout.after)
+    forbidden = answer(case, forbid=["torque_offset"]) if differs == "repeat" else None
+    assert not forbidden or (forbidden.verdict == "unknown" and "has another constant" in forbidden.rest.text)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", ["payload", "external_wrench", "gravity_tilt", "asymmetric_viscous_friction"])
+def test_what_only_some_recordings_have_is_no_constant(effect: str):
+    """A tool, a cable or friction makes another mean torque as well: with constants alone something is left."""
+    seed = int(np.random.default_rng().integers(1 << 30))
+    case = make_case([(effect, 0.15)], robot="small", repeats=1, trajectories=4, seed=seed, differs="part")
+    assert "torque_offset" not in [c.name.effect for c in answer(case).causes], seed
 
 
 @pytest.mark.slow

@@ -179,11 +179,13 @@ def _of_own_zeros(
         return None
     problem = replace(problem, records=eqx.tree_at(lambda r: r.torque, problem.records, measured.records.torque))
     first = stand(problem, here.start, here.whitening)
-    gains = [gain_of(here.problem, step, z) for z in zeros]
+    gains = [gain_of(here.problem, step, [z]) for z in zeros]
     answer = as_causes(answer, zeros, gains, joints, names)
-    held = problem.held.any()  # their constants are not known
-    before = answer.holdout.before if held else relative_error(problem, first)
-    return replace(answer, before=residual_rms(problem, first.state), holdout=replace(answer.holdout, before=before))
+    holdout = answer.holdout
+    if not problem.held.any():  # of recordings kept out no constant is known
+        after = gain_of(here.problem, step, zeros).after
+        holdout = replace(holdout, before=relative_error(problem, first), after=after)
+    return replace(answer, before=residual_rms(problem, first.state), holdout=holdout)
 
 
 class _Judged(NamedTuple):

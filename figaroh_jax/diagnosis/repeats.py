@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..recordings.signals import SAME_MOTION, Signals, apart, common_rows, moves_as
+from ..recordings.signals import SAME_MOTION, Signals, apart, common_rows
 from .flexible import to_unit
 from .layout import FOLDS, block_width
 
@@ -16,6 +16,8 @@ __all__ = ["CHANGED_SQUARES", "changed_torques", "checked_repeats", "foretold_by
 
 CHANGED_SQUARES = 0.5  # of the squares by which the torques of two repeats differ: what follows the motion is no noise
 CHANGED = 0.02  # of a joint's torque: repeats that differ by less are repeats
+ASIDE = 0.02  # of a joint's motion (standard deviation): repeats that stand that far from each other are none
+CONSTANT = 5.0  # times what repeats differ by from row to row: by more they differ all along
 RIDGE = 1e-4  # of the functions that a difference is followed by: those that a slice does not show stay small
 REVERSAL = 0.02  # of a joint's fastest speed, over which its friction changes sign
 
@@ -36,6 +38,13 @@ def checked_repeats(signals: Sequence[Signals], joints: Sequence[str]) -> list[S
         if apart(leader, one) > SAME_MOTION:
             text = f"{one.name} does not repeat {leader.name}: {note}; taken as another excitation"
             out.append(replace(one, repeat=None, notes=(*one.notes, text)))
+        elif (aside := _aside(leader, one)) is not None:
+            text = (
+                f"{one.name} moves as {leader.name} does, but reads {joints[aside[0]]} {aside[1]:+.3g} rad (or m) from"
+                " there all along: its encoder has another zero, or the robot stood elsewhere. Taken as another"
+                " excitation"
+            )
+            out.append(replace(one, repeat=None, notes=(*one.notes, text)))
         elif changed := changed_torques(leader, one):
             most = max(changed, key=lambda joint: changed[joint][0])
             text = (
@@ -49,15 +58,35 @@ def checked_repeats(signals: Sequence[Signals], joints: Sequence[str]) -> list[S
     return out
 
 
+def _aside(first: Signals, second: Signals) -> tuple[int, float] | None:
+    """The joint whose position stands farthest aside in the second of two repeats, by how much; None where none does.
+
+    A turn more is no other position. Joints with positions of several numbers are not asked.
+    """
+    if first.position.shape != first.velocity.shape:
+        return None
+    own, other = common_rows(first, second)
+    q, p = first.position[first.rows.index[own]], second.position[second.rows.index[other]]
+    by, motion = np.mean(p - q, axis=0), q.std(axis=0)
+    by -= 2 * np.pi * np.round(by / (2 * np.pi)) * (np.abs(by) > np.pi)
+    far = np.abs(by) / np.maximum(motion, 1e-3 * max(float(motion.max()), 1e-12))
+    far *= np.abs(by) > CONSTANT * (p - q).std(axis=0)
+    joint = int(np.argmax(far))
+    return (joint, float(by[joint])) if far[joint] > ASIDE else None
+
+
 def repeats_not_said(signals: Sequence[Signals]) -> tuple[str, ...]:
     """Notes on fitted recordings that move as another one does though no label says so: they could tell the noise."""
 
     def before(k: int) -> Iterator[Signals]:
         one = fitted[k]
-        return (o for o in fitted[:k] if not (one.repeat and o.repeat) and _as_long_and_far(o, one))
+        return (o for o in fitted[:k] if not (one.repeat and o.repeat) and _as_long_and_far(o, one) and near(o, one))
+
+    def near(first: Signals, second: Signals) -> bool:
+        return apart(first, second) <= SAME_MOTION and _aside(first, second) is None
 
     fitted = [one for one in signals if one.role == "fit" and not one.changed_since]
-    likes = [moves_as(one, before(k)) for k, one in enumerate(fitted)]
+    likes = [next(before(k), None) for k in range(len(fitted))]
     text = "{} moves as {} does: with the same `repeat` under `data` their differences would tell the noise"
     return tuple(text.format(one.name, like.name) for one, like in zip(fitted, likes, strict=True) if like)
 

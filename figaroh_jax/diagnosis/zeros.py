@@ -116,19 +116,22 @@ def _constants(
     return constant, deviation, constant[:, None] - over.reshape(len(there), QUARTERS) / (QUARTERS - 1)
 
 
-def gain_of(problem: Problem, step: Step, one: Zeros) -> Gain:
+def gain_of(problem: Problem, step: Step, zeros: Sequence[Zeros]) -> Gain:
     """Error of all joints, of recordings that were `shifted`, as they were and with the constants of each recording,
     told by its other quarters. It is that on data not fitted; where recordings are kept out, of which no constant is
     known, that of the others."""
     state, kept = step.state, problem.records.judged
     error = (problem.torque - predicted(problem, state)) * kept if problem.held.any() else kept_out_error(problem, step)
     before, after, whole = error.copy(), error.copy(), float(((problem.torque * kept) ** 2).sum())
-    for number, value, others in zip(one.recordings, one.value, one.others, strict=True):
-        at = problem.records.spans[number]
-        for part, foretold in zip(np.array_split(np.arange(at.row, at.row + at.rows), QUARTERS), others, strict=True):
-            used = np.asarray(kept)[at.slot, part, one.joint]
-            before[at.slot, part, one.joint] += value * used
-            after[at.slot, part, one.joint] += (value - foretold) * used
+    kept = np.asarray(kept)
+    for one in zeros:
+        for number, value, others in zip(one.recordings, one.value, one.others, strict=True):
+            at = problem.records.spans[number]
+            parts = np.array_split(np.arange(at.row, at.row + at.rows), QUARTERS)
+            for part, foretold in zip(parts, others, strict=True):
+                used = kept[at.slot, part, one.joint]
+                before[at.slot, part, one.joint] += value * used
+                after[at.slot, part, one.joint] += (value - foretold) * used
     first, last = (float(np.sqrt((x**2).sum() / max(whole, 1e-300))) for x in (before, after))
     return Gain(first, last)
 
