@@ -5,10 +5,14 @@
     python benchmarks/hidden_kinematics.py --clean 80 --seeds 100           # false names and p-values of good robots
     python benchmarks/hidden_kinematics.py --left-out --sizes 6            # errors with a history, not in the catalogue
     python benchmarks/hidden_kinematics.py --effects random_play --sizes 6  # a law that no catalogue holds
+    python benchmarks/hidden_kinematics.py --several 2 3 --seeds 0 20       # sets of two or three effects, seeds 0 to 19
+    python benchmarks/hidden_kinematics.py --differs joint_offset marker same --seeds 0 20  # the last recording differs
 
 The measurements come from Pinocchio (`tests/generators/postures.py`), which shares no code with the library. Sizes are
 in sigmas: of the noise, as the RMS that the effect moves a coordinate of a marker; of a good robot's tolerance for
 offsets, links and frames. The arms: six joints (`tests/poses.py`), and a Panda of $FIGAROH_JAX_DATA.
+Sets, and recordings of which the last differs (`tests/generators/posture_sets.py`), are drawn by seed, arm and all;
+every hidden effect is `named`, in the `set` of a cause or `missed`, and a cause that stands for none is `false`.
 """
 
 from __future__ import annotations
@@ -28,7 +32,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import poses  # noqa: E402
-from generators import postures  # noqa: E402
+from benchmarks import kinematic_sets  # noqa: E402
+from generators import posture_sets, postures  # noqa: E402
 
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", ROOT.parent / "shared" / "data"))
 HISTORY = ("settling", "reversal_hysteresis")
@@ -45,7 +50,7 @@ def arm(name: str, folder: Path) -> postures.Arm:
 
 
 def diagnose(
-    robot: postures.Arm, case: postures.Hidden, forbid: tuple[str, ...] = (), held: int = 0, **options: Any
+    robot: postures.Arm, case: postures.Hidden | posture_sets.Hidden, forbid: tuple[str, ...] = (), held: int = 0, **options: Any
 ) -> Any:
     """The library's answer to a case, the last `held` of its recordings held out."""
     from figaroh_jax.calibration.kinematic_diagnosis import diagnose_poses
@@ -89,6 +94,11 @@ def main() -> None:
         jax.config.update("jax_compilation_cache_dir", str(args.cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    if args.several or args.differs:
+        with tempfile.TemporaryDirectory() as folder:
+            robots = [arm(name, Path(folder)) for name in args.robots]
+            kinematic_sets.study(robots, range(*args.seeds), args.several, args.differs, diagnose)
+        return
     grades: dict[tuple[str, float], list[str]] = {}
     p_values, seconds = [], []
     with tempfile.TemporaryDirectory() as folder:
@@ -146,6 +156,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--orders", nargs=2, type=float, default=[2.5, 11.0], help="range of a gear error's order")
     parser.add_argument("--off", type=float, default=postures.BUILT, help="tolerances by which all links are off")
     parser.add_argument("--postures", type=int, default=80)
+    parser.add_argument("--several", nargs="+", type=int, default=[], metavar="K", help="K effects at once")
+    parser.add_argument("--differs", nargs="+", default=[], choices=kinematic_sets.CHANGES, help="in the last recording")
     parser.add_argument("--cache", type=Path, help="folder of compiled programs")
     return parser.parse_args()
 
