@@ -5,8 +5,8 @@
     python benchmarks/hidden_kinematics.py --clean 80 --seeds 100           # false names and p-values of good robots
     python benchmarks/hidden_kinematics.py --left-out --sizes 6            # errors with a history, not in the catalogue
     python benchmarks/hidden_kinematics.py --effects random_play --sizes 6  # a law that no catalogue holds
-    python benchmarks/hidden_kinematics.py --several 2 3 --seeds 0 20       # sets of two or three effects, seeds 0 to 19
-    python benchmarks/hidden_kinematics.py --differs joint_offset marker same --seeds 0 20  # the last recording differs
+    python benchmarks/hidden_kinematics.py --several 2 3 --seeds 0 20       # sets of effects, seeds 0 to 19
+    python benchmarks/hidden_kinematics.py --differs joint_offset marker same --seeds 0 20
 
 The measurements come from Pinocchio (`tests/generators/postures.py`), which shares no code with the library. Sizes are
 in sigmas: of the noise, as the RMS that the effect moves a coordinate of a marker; of a good robot's tolerance for
@@ -32,8 +32,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import poses  # noqa: E402
-from benchmarks import kinematic_sets  # noqa: E402
 from generators import posture_sets, postures  # noqa: E402
+
+from benchmarks import kinematic_sets  # noqa: E402
 
 DATA = Path(os.environ.get("FIGAROH_JAX_DATA", ROOT.parent / "shared" / "data"))
 HISTORY = ("settling", "reversal_hysteresis")
@@ -50,7 +51,11 @@ def arm(name: str, folder: Path) -> postures.Arm:
 
 
 def diagnose(
-    robot: postures.Arm, case: postures.Hidden | posture_sets.Hidden, forbid: tuple[str, ...] = (), held: int = 0, **options: Any
+    robot: postures.Arm,
+    case: postures.Hidden | posture_sets.Hidden,
+    forbid: tuple[str, ...] = (),
+    held: int = 0,
+    **options: Any,
 ) -> Any:
     """The library's answer to a case, the last `held` of its recordings held out."""
     from figaroh_jax.calibration.kinematic_diagnosis import diagnose_poses
@@ -157,7 +162,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--off", type=float, default=postures.BUILT, help="tolerances by which all links are off")
     parser.add_argument("--postures", type=int, default=80)
     parser.add_argument("--several", nargs="+", type=int, default=[], metavar="K", help="K effects at once")
-    parser.add_argument("--differs", nargs="+", default=[], choices=kinematic_sets.CHANGES, help="in the last recording")
+    parser.add_argument(
+        "--differs", nargs="+", default=[], choices=kinematic_sets.CHANGES, help="in the last recording"
+    )
     parser.add_argument("--cache", type=Path, help="folder of compiled programs")
     return parser.parse_args()
 

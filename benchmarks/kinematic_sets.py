@@ -59,6 +59,11 @@ def graded(case: posture_sets.Hidden, found: Any) -> Graded:
 def _sigmas(cause: Any, truth: posture_sets.Truth) -> list[tuple[str, float]]:
     """How far each plain number is from the truth, in standard deviations; of waves the amplitude."""
     values = dict(cause.parameters)
+    if not values:  # it has no one size
+        return []
+    values = {
+        name.partition(" ")[0]: one for name, one in values.items()
+    }  # an offset of the last recording: "change in"
     if "amplitude" in truth.values:
         pair = [values.pop(name) for name in ("sine", "cosine")]
         size = float(np.hypot(*(one.value for one in pair)))
@@ -117,7 +122,9 @@ def _told(found: Any) -> bool:
 
 
 def _line(head: str, case: posture_sets.Hidden, found: Any, grade: Graded) -> str:
-    truths = [f"{t.name[0]} ({', '.join(t.name[1])}) x{t.size:g} {m}" for t, m in zip(case.truths, grade.marks, strict=True)]
+    truths = [
+        f"{t.name[0]} ({', '.join(t.name[1])}) x{t.size:g} {m}" for t, m in zip(case.truths, grade.marks, strict=True)
+    ]
     causes = []
     for cause in found.causes:
         alike = "/".join(f"{other.effect} {' '.join(other.at)}" for other in cause.ambiguous_with)

@@ -30,6 +30,7 @@ from ..rigid.model import RobotModel
 from . import corrections, levels, thresholds
 from .calibrated import Calibration, Error, Outlier
 from .candidates import Block, blocks_of, effects_on, empty_columns, geometry_columns, known_frames
+from .changes import Change, find_change, frames_told, own_zero, with_own_frames
 from .distances import socket_distances
 from .kinematic_scores import Tested, row_noise, score_blocks, score_waves
 from .outliers import find_outliers
@@ -135,6 +136,8 @@ class Run:
     extension: list[Block]  # the named effects as they are fitted
     history: bool  # whether an error that depends on the posture before was found and has no name
     unsure: list[Nearest]  # effects that predict better and are not named
+    changes: list[Change]  # between recordings, that have unknowns of their own
+    unlike: Change | None  # what looks most like a change that has none
     fit: tuple[Measured, marginal.Linear, marginal.Posterior, Solution]
 
     def __init__(
@@ -174,6 +177,9 @@ class Run:
         extending = bool(self.blocks) and self.level is None and self.priors
         self.effects = effects_on(self.model, self.postures, measured, self.blocks) if extending else None
         choice = levels.choose(measured, everything, self.effects, self.level)
+        choice = self._apart(choice)
+        measured = self.measured
+        everything = measured.fitted
         wide = self._wide(choice)  # with its effects: what they explain is no outlier
         sizes = find_outliers(wide, everything, levels.free_at(choice.level, wide.prior))
         self.outliers = tuple(
@@ -200,6 +206,54 @@ class Run:
         if self.history:
             self.notes.append("the error of a posture depends on the one before it in a way that no effect explains")
         return self._result()
+
+    def _apart(self, choice: levels.Choice) -> levels.Choice:
+        """The choice again, after each change between recordings that is found has unknowns of its own."""
+        self.changes, self.unlike = [], None
+        while self.effects is not None and len(self.changes) < thresholds.CHANGES:
+            wide = self._wide(choice._replace(level="full"))
+            grid = range(self.effects.grid)
+            Z = self.effects.jacobian(choice.fits["full"][0].at, grid)
+            blocks = [(self.blocks[k].name, Z[:, s]) for k, s in self.effects.slices(grid).items()]
+            chance = thresholds.OF_ALPHA * self.alpha
+            change = find_change(self.measured, self.recordings, wide, self.measured.fitted, blocks, chance)
+            if change is None:
+                return choice
+            if change.name is not None and change.name.effect != "joint_offset":
+                self.unlike = change
+                return choice
+            self.changes.append(change)
+            self._take_apart(change)
+            choice = levels.choose(self.measured, self.measured.fitted, self.effects, self.level)
+        return choice
+
+    def _take_apart(self, change: Change) -> None:
+        """Give a recording frames of its own, or a joint another zero in it."""
+        columns = list(self.measured.columns)
+        if change.name is None:
+            self.recordings = with_own_frames(self.recordings, change.recording)
+        else:
+            own = next(c for c in columns if (c.effect, c.at) == change.name)
+            columns.append(own_zero(own, self.postures[change.recording], self.recordings[change.recording].name))
+        self.measured = assemble(self.weighing, self.recordings, self.postures, columns, [1e-3] * len(columns))
+        self.effects = effects_on(self.model, self.postures, self.measured, self.blocks)
+
+    def _changes_told(self, final: Measured, at: Float[np.ndarray, " unknowns"]) -> list[str]:
+        """Notes on what was not the same in all recordings."""
+        frames, told = corrections.frames_of(final, at), []
+        for change in self.changes:
+            name = self.recordings[change.recording].name
+            if change.name is None:
+                told.append(frames_told(self.recordings, change.recording, frames))
+            else:
+                told.append(f"the recordings differ: {change.name.at[0]} has another zero in {name} than in the others")
+        if self.unlike is not None:
+            name, least = self.recordings[self.unlike.recording].name, self.unlike.name
+            told.append(
+                f"the recordings differ: {name} errs in a way that the others do not, most like {least}; diagnose each"
+                " alone"
+            )
+        return told
 
     def _name(self) -> None:
         """The effects that the folds find again and that are sure, fitted beside the level."""
@@ -316,6 +370,7 @@ class Run:
 
     def _result(self) -> Calibration:
         final, linear, posterior, solution = self.fit
+        self.notes += self._changes_told(final, linear.at)
         level, free = self.choice.level, levels.free_at(self.choice.level, linear.prior)
         frames = self.choice.fits["frames"][0].residual
         gauge, order = corrections.gauge_of(final, linear, self.used, free)

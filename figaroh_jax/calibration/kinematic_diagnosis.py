@@ -26,6 +26,7 @@ from . import levels, thresholds
 from .calibrated import Calibration
 from .calibration import Run
 from .candidates import GEOMETRY, moved_rows, moves, twist_rows
+from .changes import ZERO
 from .kinematic_evidence import Evidence, weigh
 from .kinematic_scores import EXACT, Scores, Tested, row_noise, score_blocks, score_jitter
 from .outliers import playing_joints, still_outliers, variance_along
@@ -108,13 +109,23 @@ def diagnose_poses(
             within = [c for c, s in zip(outliers, still, strict=True) if not s]
             notes += [f"{c.note}, no farther than a joint that varies so may move it" for c in within]
             outliers = [c for c, s in zip(outliers, still, strict=True) if s]
+        if run.unlike is not None:
+            outliers = []  # what one recording has for itself is no error of its postures
+            geometry, effects, dropped = _alike(run.unlike.name, geometry, effects)
+            own = own._replace(nearest=[*own.nearest, *dropped])
         if calibration.contradicted:
             aside += [(c, _CONTRADICTED) for c in effects]
             own = own._replace(nearest=[*own.nearest, *(Nearest(c.name, 0.0, _CONTRADICTED) for c in geometry)])
             outliers, geometry, effects = [], [], []
         causes = tuple([*outliers, *geometry, *effects])
         p_value = min(1.0, 2.0 * min(own.p_value, run.p_effects))
-        left_over = run.history or play.found or p_rest < thresholds.OF_ALPHA * alpha
+        left_over = (
+            run.history
+            or play.found
+            or bool(run.changes)
+            or run.unlike is not None
+            or p_rest < thresholds.OF_ALPHA * alpha
+        )
         rest = own.rest or (left_over and not _exact(run))
         rest = rest or calibration.contradicted or _beyond_accuracy(recordings, calibration)
         rest = rest or (found and not (geometry or effects)) or len(own.causes) > len(geometry)
@@ -122,6 +133,21 @@ def diagnose_poses(
         nearest += run.unsure
         left = _left(calibration, run)
         return _answer(replace(calibration, notes=tuple(notes)), causes, p_value, rest, nearest, left)
+
+
+def _alike(
+    unlike: Name | None, geometry: list[Cause], effects: list[Cause]
+) -> tuple[list[Cause], list[Cause], list[Nearest]]:
+    """What is named, and what came near, where one recording errs in a way of its own, most like the effect `unlike`.
+
+    An effect that all of them show is the one that they do not have alike, and has no one size; else nothing is named.
+    """
+    if unlike is not None and unlike not in [c.name for c in effects]:
+        why = "the recordings differ in a way that has no name"
+        near = [Nearest(unlike, 0.0, "most like what one of the recordings has for itself")]
+        return [], [], near + [Nearest(c.name, _share(c.gain), why) for c in (*effects, *geometry)]
+    note = "the recordings do not have it alike: it has no one size"
+    return geometry, [replace(c, parameters={}, note=note) if c.name == unlike else c for c in effects], []
 
 
 def _allowed(cause: Cause, forbid: Sequence[str]) -> tuple[Name, ...]:
@@ -163,7 +189,8 @@ def _geometry_of(run: Run, tolerance: tuple[float, float]) -> _Geometry:
     columns = [(c.parameter, c.unit, float(size)) for c, size in zip(measured.columns, scale, strict=False)]
     groups = _widths(tolerance)
     width = groups[np.maximum(linear.prior, 0)]
-    names = [Name(c.effect, c.at) for c in measured.columns]
+    names = [Name("joint_offset" if c.effect == ZERO else c.effect, c.at) for c in measured.columns]
+    width[[k for k, c in enumerate(measured.columns) if c.effect == ZERO]] = groups[0]
     places = {name: np.array([k for k, n in enumerate(names) if n == name]) for name in names}
     if added:
         Z = moved_rows(measured, twist_rows(measured, linear.at), [moves(c, run.postures) for c in added])

@@ -15,6 +15,11 @@ MOST_EFFECTS = 6
 FOLDS_THAT_CHOOSE = 4  # of five outer folds, that must choose an effect for it to stay
 OUTER_GAIN = 0.05  # that all effects together must take away on the outer folds
 
+# Recordings that differ (`changes`)
+OWN_POSTURES = 8  # of a recording that is compared with others
+WORTH = 5.0  # squares that one more column must explain
+CHANGES = 4  # that are looked for
+
 # Outliers (`outliers`)
 FAR = 8.0  # sizes of the noise; what is nearer may be a heavy tail, which the robust fit bears,
 ALONE = 4.5  # unless it is that many standard deviations off the logarithms of the others' sizes

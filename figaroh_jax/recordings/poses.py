@@ -56,6 +56,7 @@ class PoseRecording:
     notes: tuple[str, ...] = ()
     device: Device | None = None  # of kind "own"
     carried: bool = False  # poses of a camera that the robot carries: told by how it sees what stands in the origin
+    apart: bool = False  # its unknown frames are its own, whichever device others have
 
     def __repr__(self) -> str:
         way = f"{self.kind} {np.shape(self.values)} from {self.base_frame} to {self.tool_frame}"

@@ -71,19 +71,18 @@ def differ(arm: Arm, change: str | None, beside: int, rng: np.random.Generator, 
     device, tool = pin.SE3(pin.exp3(rng.normal(size=3)), rng.normal(size=3)), pin.SE3.Identity()
     late = np.arange(len(q)) >= (runs - 1) * count
     if change in postures.EFFECTS:
-        others = {truth.name for truth in truths}
-        for _ in range(200):
+        name, values, extra = _one(arm, str(change), _size(str(change), rng), rng, q, built)
+        while name in [truth.name for truth in truths]:
             name, values, extra = _one(arm, str(change), _size(str(change), rng), rng, q, built)
-            if name not in others:
-                break
         error = _sum(error, extra._replace(shift=extra.shift * late[:, None], twist=extra.twist * late[:, None, None]))
+        if change == "joint_offset":
+            by = float(extra.shift[0].sum())
+            values = {"offset": values["offset"] - by, "change": by}
         truths = (*truths, Truth(name, 0.0, values))
     moved = _moved(rng) if change in ("marker", "tracker") else pin.SE3.Identity()
     places = {"marker": (device, moved), "tracker": (device * moved, tool)}.get(str(change), (device, tool))
     poses = postures._poses(arm, q, built, error)
-    seen = _seen(
-        [places[0] * p * places[1] if last else device * p for p, last in zip(poses, late, strict=True)], rng
-    )
+    seen = _seen([places[0] * p * places[1] if last else device * p for p, last in zip(poses, late, strict=True)], rng)
     parts = [slice(k * count, (k + 1) * count) for k in range(runs)]
     time = postures.INTERVAL * np.arange(count)
     return Hidden(truths, change or "", tuple(Recording(time, q[p], seen[p], False) for p in parts))

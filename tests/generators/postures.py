@@ -347,7 +347,7 @@ def as_seen(poses: list[pin.SE3], rng: np.random.Generator) -> np.ndarray:
     return found
 
 
-def arguments(arm: Arm, recording: Recording, hidden: Hidden) -> dict[str, Any]:
+def arguments(arm: Arm, recording: Recording, hidden: Any = None) -> dict[str, Any]:
     """Plain values of a recording, as a task or a test hands them over."""
     kind = "pose" if recording.seen.shape[1:] == (4, 4) else "position"
     load = {"frame": arm.tool, "mass": LOAD[0], "com": LOAD[1]} if recording.loaded else None
