@@ -178,9 +178,10 @@ class _Geometry(NamedTuple):
     width: np.ndarray  # stated tolerance of each unknown, in its size
 
 
-def _geometry_of(run: Run, tolerance: tuple[float, float]) -> _Geometry:
-    linear, _ = run.choice.fits["full"]
+def _geometry_of(run: Run, tolerance: tuple[float, float], about: np.ndarray | None = None) -> _Geometry:
+    """The rows about the fit of full geometry, or `about` other unknowns of it."""
     measured = run.measured
+    linear = run.choice.fits["full"][0] if about is None else levels.linearise(measured, about)
     known = [b for b in run.blocks if b.effect.name == "base_frame"] if run.effects else []
     extra = [*run.extension, *known]
     added = [column for block in extra for column in block.columns]
@@ -230,7 +231,7 @@ def _geometry(run: Run, calibration: Calibration, alpha: float, tolerance: tuple
         return _Named([], first, False, [], [])
     kept = _needed(linear, noise, run.used, places, named)
     told, same, dropped = weigh(Evidence(linear, noise, run.used, stated, places, kept), kept, size.tolist())
-    at, covariance = _posterior_mode(linear, noise, run.used, told.width)
+    at, covariance = _settled(run, tolerance, noise, told.width)
     gain, twins = _gain(calibration), _twins(run)
     causes = []
     for k in told.chosen:
@@ -254,6 +255,23 @@ def _geometry(run: Run, calibration: Calibration, alpha: float, tolerance: tuple
     rest = scores.p_value <= thresholds.OF_ALPHA * alpha
     near = _not_told(linear, noise, run.used, told.width, places, names, dropped) if rest else []
     return _Named(causes, first, rest, [_grown(told.growth, tolerance)] if rest else [], near)
+
+
+def _settled(
+    run: Run, tolerance: tuple[float, float], noise: np.ndarray, width: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The unknowns at prior widths, and their covariance, linearised anew until they stay.
+
+    A fit with other widths shares what postures do not tell apart otherwise, by which products of errors change.
+    """
+    linear, count = _geometry_of(run, tolerance).linear, len(run.choice.fits["full"][0].at)
+    at, covariance = _posterior_mode(linear, noise, run.used, width)
+    for _ in range(thresholds.SETTLING):
+        before = at
+        at, covariance = _posterior_mode(_geometry_of(run, tolerance, at[:count]).linear, noise, run.used, width)
+        if np.abs(at - before).max() < 1e-3:  # mrad and mm
+            break
+    return at, covariance
 
 
 def _beyond(

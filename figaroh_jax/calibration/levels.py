@@ -9,19 +9,19 @@ folds, so that what it reports on the postures of a fold was chosen without them
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..effects.kinematic import Column
 from ..estimation import marginal, posefit
 from ..estimation.marginal import FLAT, Linear, Posterior
 from ..estimation.posegroups import Measured
 from ..estimation.posesolver import solve
 from . import thresholds
-from .kinematic_scores import Tested, Waves, row_noise, waves_shown
+from .joining import Effects, Inner, joined, rms
+from .kinematic_scores import Tested, row_noise, waves_shown
 
 __all__ = [
     "EFFECT",
@@ -44,24 +44,8 @@ EFFECT, _EMPTY = 3, 4  # prior groups: 0 offsets, 1 translations, 2 rotations, 3
 _TOLERANCE = (5.0, 1.0, 1.0, 1.0, 1.0)  # stated widths in mrad or mm
 _NO_WIDTH = 1e6  # of a prior that says nothing
 _PATIENCE = 2000  # steps along the valleys of what the data hardly show
-_EFFECT_WIDTH = 3.0  # of an effect's coefficient, in sizes that move its joint by 1 mrad or 1 mm RMS
 
 Array = np.ndarray
-
-
-class Effects(NamedTuple):
-    """Candidate effects, each a block of columns, linear at the nominal robot with its frames."""
-
-    blocks: tuple[tuple[Column, ...], ...]
-    jacobian: Callable[[Float[Array, " unknowns"], Sequence[int]], Float[Array, "rows some"]]  # of blocks, side by side
-    handicap: Float[Array, " blocks"]  # share of the error by which a more flexible effect must do better
-    grid: int  # so many blocks come before the gear errors of high order, of which `waves` tells which to look at
-    waves: Callable[[Float[Array, " unknowns"]], Iterator[Waves]]  # joint by joint, at a fit
-
-    def slices(self, which: Sequence[int]) -> dict[int, slice]:
-        """Columns of each of the blocks `which` when they stand side by side."""
-        ends = np.cumsum([0, *(len(self.blocks[k]) for k in which)])
-        return {k: slice(a, b) for k, a, b in zip(which, ends[:-1], ends[1:], strict=True)}
 
 
 class Choice(NamedTuple):
@@ -155,11 +139,6 @@ def errors(measured: Measured, residual: Float[Array, " rows"], postures: Int[Ar
     return found[0], found[1]
 
 
-def rms(values: Array) -> float:
-    """Root mean square; NaN of nothing."""
-    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
-
-
 def pooled(parts: Sequence[tuple[Array, Array]]) -> tuple[float, float]:
     """RMS error of all folds together, m and rad."""
     a, b = (rms(np.concatenate([part[c] for part in parts])) for c in (0, 1))
@@ -245,10 +224,6 @@ def _held_out(measured: Measured, linear: Linear, used: Array, posterior: Poster
     return float(np.exp(np.mean([np.mean(np.log(part + 1e-15)) for part in parts if len(part)])))
 
 
-def _score(parts: Sequence[Array]) -> float:
-    return float(np.exp(np.mean([np.log(rms(part) + 1e-15) for part in parts if len(part)])))
-
-
 def _forward(
     measured: Measured,
     used: Array,
@@ -269,10 +244,10 @@ def _forward(
     ]
     tested = Tested(linear, row_noise(linear, posterior), used, posterior.precision, free)
 
-    def joined(which: Sequence[int]) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...], dict[str, float]]:
+    def taken_in(which: Sequence[int]) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...], dict[str, float]]:
         Z = effects.jacobian(linear.at, which)
-        folds = [_Inner.make(measured, linear, *one, free, Z) for one in inner]
-        return _joined(folds, effects, which, level, _room(posterior, used))
+        folds = [Inner.make(measured, linear, *one, free, Z) for one in inner]
+        return joined(folds, effects, which, level, _room(posterior, used))
 
     def shown(beside: Sequence[int]) -> list[int]:
         columns = effects.jacobian(linear.at, beside)
@@ -280,121 +255,12 @@ def _forward(
         return waves_shown(tested, waves, columns, parts)
 
     which = [*range(effects.grid), *shown(())]
-    chosen, rivals, found = joined(which)
+    chosen, rivals, found = taken_in(which)
     more = sorted(set(shown(chosen)) - set(which)) if chosen else []
     if more:
-        chosen, rivals, found = joined([*which, *more])
+        chosen, rivals, found = taken_in([*which, *more])
     scores.update(found)
     return chosen, rivals
-
-
-def _joined(
-    folds: Sequence[_Inner], effects: Effects, which: Sequence[int], level: str, room: float
-) -> tuple[tuple[int, ...], tuple[tuple[int, ...], ...], dict[str, float]]:
-    """Of the blocks `which`, those that join, what gains nearly as much as each, and the errors on the inner folds.
-
-    There is `room` for so many columns.
-    """
-    slices, chosen, rivals, scores = effects.slices(which), [], [], {}
-    current = _score_of(folds)
-    while len(chosen) < thresholds.MOST_EFFECTS:
-        left = room - sum(len(effects.blocks[k]) for k in chosen)
-        ranked = [k for k in _screen(folds, slices, chosen) if len(effects.blocks[k]) <= left]
-        trials = {k: _score_of(folds, np.r_[slices[k]]) for k in ranked[:12]}
-        best = min(trials, key=lambda k: trials[k] * (1.0 + effects.handicap[k]), default=None)
-        if best is None or trials[best] > (1.0 - thresholds.EFFECT_GAIN) * current:
-            break
-        for inner in folds:
-            inner.take(np.r_[slices[best]])
-        close = current - thresholds.RIVAL * (current - trials[best])
-        rivals.append(tuple(k for k in trials if k != best and trials[k] < close))
-        current = trials[best]
-        chosen.append(best)
-        scores[f"{level} + " + " + ".join(_name(effects.blocks[k]) for k in chosen)] = current
-    return tuple(chosen), tuple(rivals), scores
-
-
-def _name(block: tuple[Column, ...]) -> str:
-    return " ".join([block[0].effect, *block[0].at])
-
-
-class _Inner(NamedTuple):
-    """An inner fold whitened by its own fit: what candidates are regressed on, and what they must predict."""
-
-    residual: list[Array]  # [whitened, to fit; in m and rad, left out]
-    columns: list[Array]  # candidates, projected off what is fitted already: [to fit; left out]
-    shape: tuple[Array, Array, int]  # channel and item of the rows left out; how many items
-
-    @classmethod
-    def make(cls, measured, linear, inner: Posterior, rows, fold, free, Z) -> _Inner:
-        weight = np.where(linear.posture >= 0, inner.weight[linear.posture], 1.0)
-        scale = np.sqrt(weight) / inner.noise[linear.channel]
-        fit, out = np.flatnonzero(rows), np.flatnonzero(measured.measured & np.isin(measured.posture, fold))
-        residual = linear.residual + linear.jacobian @ (inner.unknowns - linear.at)
-        J = linear.jacobian[:, free]
-        G = J[fit] * scale[fit, None]
-        inverse = inner.covariance[np.ix_(free, free)]
-        Z_fit = Z[fit] * scale[fit, None]
-        pull = inverse @ (G.T @ Z_fit)  # how the fitted unknowns give way to a candidate
-        _, item = np.unique(measured.item[out], return_inverse=True)
-        # prior rows belong to the fit: they too see the unknowns give way
-        prior = np.sqrt(inner.precision[free])[:, None]
-        r_fit = np.concatenate([residual[fit] * scale[fit], prior[:, 0] * inner.unknowns[free]])
-        c_fit = np.concatenate([Z_fit - G @ pull, -prior * pull])
-        return cls(
-            [r_fit, residual[out]], [c_fit, Z[out] - J[out] @ pull], (measured.channel[out], item, item.max() + 1)
-        )
-
-    def solve(self, which: Array) -> tuple[Array, Array]:
-        """Coefficients of the candidates `which` and their normal matrix, each with a wide prior."""
-        C = self.columns[0][:, which]
-        normal = C.T @ C + np.eye(len(which)) / _EFFECT_WIDTH**2
-        return -np.linalg.solve(normal, C.T @ self.residual[0]), normal
-
-    def drops(self, which: Int[Array, "blocks width"]) -> Float[Array, " blocks"]:
-        """What each block of candidates, by itself, takes from the squares of the fitted rows."""
-        C = self.columns[0][:, which]
-        normal = np.einsum("rbi,rbj->bij", C, C, optimize=True) + np.eye(which.shape[1]) / _EFFECT_WIDTH**2
-        pull = np.tensordot(self.residual[0], C, axes=1)
-        return np.sum(pull * np.linalg.solve(normal, pull[..., None])[..., 0], axis=1)
-
-    def error(self, which: Array) -> list[Array]:
-        residual = self.residual[1] + (self.columns[1][:, which] @ self.solve(which)[0] if len(which) else 0.0)
-        channel, item, count = self.shape
-        parts = []
-        for c in (0, 1):
-            mine = channel == c
-            square = np.bincount(item[mine], residual[mine] ** 2, minlength=count)
-            parts.append(np.sqrt(square[np.bincount(item[mine], minlength=count) > 0]))
-        return parts
-
-    def take(self, which: Array) -> None:
-        """Fit the candidates `which` for good: project them out of all the others."""
-        beta, normal = self.solve(which)
-        C, D = self.columns[0][:, which], self.columns[1][:, which]
-        pull = np.linalg.solve(normal, C.T @ self.columns[0])
-        self.residual[0] = self.residual[0] + C @ beta
-        self.residual[1] = self.residual[1] + D @ beta
-        self.columns[0] = self.columns[0] - C @ pull
-        self.columns[1] = self.columns[1] - D @ pull
-
-
-def _score_of(folds: Sequence[_Inner], which: Array | None = None) -> float:
-    parts = [inner.error(np.zeros(0, int) if which is None else which) for inner in folds]
-    return _score([np.concatenate([part[c] for part in parts]) for c in (0, 1)])
-
-
-def _screen(folds: Sequence[_Inner], slices: Mapping[int, slice], taken: Sequence[int]) -> list[int]:
-    """Blocks by how much of the fitted rows they explain, for their number of columns; not those taken already."""
-    merit, by_width = {}, {}
-    for k, block in slices.items():
-        if k not in taken:
-            by_width.setdefault(block.stop - block.start, []).append(k)
-    for width, mine in by_width.items():  # blocks of one width at once
-        columns = np.array([np.r_[slices[k]] for k in mine])
-        drops = np.mean([inner.drops(columns) for inner in folds], axis=0)
-        merit |= zip(mine, drops - width * np.log(len(folds[0].residual[0])) / 2, strict=True)
-    return sorted(merit, key=lambda k: -merit[k])
 
 
 def nested(

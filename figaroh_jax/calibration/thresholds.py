@@ -12,6 +12,7 @@ LEVEL_GAIN = 0.01  # that a level must take away from the one below it
 EFFECT_GAIN = 0.03  # that an effect must take away to be taken in
 RIVAL = 0.9  # of the best effect's gain: what gains that much is not told apart from it
 MOST_EFFECTS = 6
+STARTS = 4  # other effects of a joint, by which a search that took two of it begins anew
 FOLDS_THAT_CHOOSE = 4  # of five outer folds, that must choose an effect for it to stay
 OUTER_GAIN = 0.05  # that all effects together must take away on the outer folds
 
@@ -36,6 +37,7 @@ TOLERANCE = (1e-3, 5e-4)  # rad (or m), m: how well a good robot is zeroed and b
 TURN = 1e-3  # rad that a link may be turned where it may be shifted by as much as that
 MOST_GEOMETRY = 16  # causes of the geometry
 OF_ALPHA = 1 / 5  # share of the error rate of a task that geometry, effects, play and the rest may each spend
+SETTLING = 6  # times that the rows are linearised anew about named geometry
 LOSS_SIGMAS = 1.0  # standard errors by which left-out postures must be worse without a named geometry
 TOLD = 3.0  # logarithm of the odds (20 to 1) by which a correction of the geometry is told from another, or from none
 FAR_OFF = 2.5  # tolerances by which all links are off where a name must be the best of all that there are
