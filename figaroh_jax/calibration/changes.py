@@ -73,11 +73,27 @@ def _merit(q: Array, size: Array) -> Array:
 
 
 def _comparable(measured: Measured, recordings: Sequence[PoseRecording], used: Array) -> list[int]:
-    """The fitted recordings that may differ from the others; of two it is the second."""
+    """The fitted recordings that may differ from the others, of two the second; each has postures as the others have.
+
+    What the model lacks in one part of the workspace would look like a change in a recording that was made there alone.
+    """
     postures = np.unique(measured.posture[used & (measured.posture >= 0)])
     count = np.bincount(measured.recording[postures], minlength=len(recordings))
-    fitted = [k for k in range(len(recordings)) if count[k] >= thresholds.OWN_POSTURES]
-    return fitted if len(fitted) > 2 else fitted[1:]
+    free = [k for k, r in enumerate(recordings) if r.kind in ("pose", "position")]
+    fitted = [k for k in free if count[k] >= thresholds.OWN_POSTURES]
+    alike = [k for k in fitted if _among(recordings[k], [recordings[j] for j in fitted if j != k])]
+    return alike if len(fitted) > 2 else [k for k in alike if k != fitted[0]]
+
+
+def _among(one: PoseRecording, others: Sequence[PoseRecording]) -> bool:
+    """Whether the postures of a recording lie where those of the others do, joint by joint."""
+    if not others:
+        return False
+    q, rest = one.position, np.concatenate([other.position for other in others])
+    spread, wide = q.std(axis=0), rest.std(axis=0)
+    apart = np.abs(q.mean(axis=0) - rest.mean(axis=0))
+    near = apart <= thresholds.AMONG * np.minimum(spread, wide) + 1e-9
+    return bool(np.all(near & (spread <= 2.0 * wide + 1e-9) & (wide <= 2.0 * spread + 1e-9)))
 
 
 def _own(

@@ -55,7 +55,8 @@ def joined(
     """Of the blocks `which`, those that join, what gains nearly as much as each, and the errors on the inner folds.
 
     There is `room` for so many columns. Two effects of one joint may be taken for two others when they join one by
-    one: each other effect of the joint starts the search again, and the set that predicts best is kept.
+    one: each other effect of the joint starts the search again, and a set that predicts better by as much as an effect
+    must gain takes their place.
     """
     slices = effects.slices(which)
     best = _grown(folds, effects, slices, level, room, ())
@@ -64,7 +65,9 @@ def joined(
         others = tuple(k for k in best.chosen if _at(effects, k) != place)
         for start in _alternatives(folds, effects, slices, others, place, [_label(effects, k) for k in best.chosen]):
             found.append(_grown(folds, effects, slices, level, room, (*others, start)))
-    best = min(found, key=lambda one: one.cost(effects))
+    other = min(found, key=lambda one: one.cost(effects))
+    if other.cost(effects) < (1.0 - thresholds.EFFECT_GAIN) * best.cost(effects):
+        best = other
     rivals = [
         (*own, *_in_place(folds, effects, slices, best, k, [one for one in found if one is not best]))
         for k, own in zip(best.chosen, best.rivals, strict=True)

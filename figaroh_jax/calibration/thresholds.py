@@ -18,6 +18,7 @@ OUTER_GAIN = 0.05  # that all effects together must take away on the outer folds
 
 # Recordings that differ (`changes`)
 OWN_POSTURES = 8  # of a recording that is compared with others
+AMONG = 1.0  # standard deviations of a joint's position, by which their means may differ
 WORTH = 5.0  # squares that one more column must explain
 CHANGES = 4  # that are looked for
 
