@@ -32,8 +32,8 @@ def test_a_marker_that_was_moved_between_recordings_is_told_and_no_posture_is_an
     case = posture_sets.differ(study().arm("arm6", folder), "marker", 0, np.random.default_rng(), 30)
     _, found = graded(folder, case)
     assert (found.verdict, found.causes) == ("unknown", ()), found.causes
-    (note,) = told(found)
-    assert f"in run{len(case.recordings) - 1} the device or its marker" in note and "tool_frame" in note
+    place = f"in run{len(case.recordings) - 1} the device or its marker"
+    assert any(place in note and "tool_frame" in note for note in told(found)), told(found)
 
 
 def test_a_joint_that_lost_its_zero_between_recordings_is_named_with_both(folder: Path):
