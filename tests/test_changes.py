@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from generators import Case, available, make_case
 from generators.inverse import shares_of
 from generators.scoring import judge, table
@@ -19,6 +20,7 @@ from test_layout import other
 from figaroh_jax.diagnosis.diagnosis import diagnose_task
 from figaroh_jax.diagnosis.repeats import changed_torques, checked_repeats, repeats_not_said
 from figaroh_jax.formats import config
+from figaroh_jax.formats.export import model_files
 from figaroh_jax.recordings.signals import Signals
 from figaroh_jax.results import Diagnosis
 
@@ -143,7 +145,7 @@ def test_a_tool_in_half_of_the_recordings_is_not_nothing(seed: int):
 
 def constants_told(found: Diagnosis) -> dict[str, tuple[float, float]]:
     """By recording, of the one joint of which an answer says that they differ."""
-    (note,) = [note for note in found.notes if "has another constant in each recording" in note]
+    (note,) = [note for note in found.notes if "does not have one constant in all recordings" in note]
     number = r"([+-][\d.e-]+) \+- ([\d.e-]+) N m \(or N\) in (\w+)"
     return {name: (float(value), float(half)) for value, half, name in re.findall(number, note)}
 
@@ -166,8 +168,11 @@ def test_a_torque_that_was_zeroed_anew_is_named_with_each_constant(differs: str,
     assert found.causes[0].parameters["spread"].value == pytest.approx(each.std(), rel=0.05)
     gain = found.causes[0].gain
     assert gain.after < gain.before < found.holdout.before and gain.after == pytest.approx(found.holdout.after)
+    effects = yaml.safe_load(model_files(found.model, found.causes)["effects.yaml"])["effects"]
+    (effect,) = [one for one in effects if one["effect"] == "torque_offset"]
+    assert effect["parameters"]["offset"]["value"] == pytest.approx(found.causes[0].parameters["offset"].value)
     forbidden = answer(case, forbid=["torque_offset"]) if differs == "repeat" else None
-    assert not forbidden or (forbidden.verdict == "unknown" and "has another constant" in forbidden.rest.text)
+    assert not forbidden or (forbidden.verdict == "unknown" and "does not have one constant" in forbidden.rest.text)
 
 
 @pytest.mark.slow

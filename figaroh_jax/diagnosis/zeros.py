@@ -149,11 +149,15 @@ def shifted(signals: Sequence[Signals], zeros: Sequence[Zeros]) -> list[Signals]
 
 def told(one: Zeros, joints: Sequence[str], names: Sequence[str]) -> str:
     """What recordings have, in words."""
+    return f"the torque of {joints[one.joint]} does not have one constant in all recordings: {_each(one, names)}"
+
+
+def _each(one: Zeros, names: Sequence[str]) -> str:
     each = ", ".join(
         f"{one.value[k]:+.3g} +- {1.96 * one.deviation[k]:.2g} N m (or N) in {names[one.recordings[k]]}"
         for k in shown_of_many(one.value)
     )
-    return f"the torque of {joints[one.joint]} has another constant in each recording: beside their mean {each}"
+    return f"beside the mean {each}"
 
 
 def as_causes(
@@ -166,7 +170,7 @@ def as_causes(
         alike = tuple(Name(other, name.at) for other in related(EFFECT, "indistinguishable_from"))
         same = next((c for c in causes if c.name == name or (c.name in alike and name in c.ambiguous_with)), None)
         numbers = {**(same.parameters if same and same.name == name else {}), "spread": one.spread}
-        note = "the extended model has the mean of all recordings"
+        note = f"the extended model has the mean of all recordings; {_each(one, names)}"
         found = same.found if same else len(causes) + 1
         cause = Cause(name, numbers, 1 - one.p_value, gain, alike, found, note)
         causes = [c for c in causes if c is not same] + [cause]

@@ -197,8 +197,9 @@ def _describe(
     at = place_names(robot, effect)
     same = [c.parameters for c in causes if c.name == (effect.name, at)]
     values = _physical(effect)
-    # a joint may have two of them
-    known = next((p for p in same if all(np.isclose(p[n].value, values[n]) for n in p)), (same or [{}])[0])
+    # a joint may have two of them; what recordings differ by is no number of the model
+    alike = (p for p in same if all(np.isclose(p[n].value, values[n]) for n in values if n in p))
+    known = next(alike, (same or [{}])[0])
     answer = {
         "effect": effect.name,
         "at": list(at),
