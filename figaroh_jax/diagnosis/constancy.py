@@ -23,6 +23,7 @@ from .step import Step
 
 __all__ = [
     "fitted_recordings",
+    "follows_own_motion",
     "of_one_recording",
     "recordings_that_differ",
     "shares_by_recording",
@@ -191,6 +192,24 @@ def of_one_recording(problem: Problem, step: Step, tolerance: float) -> Follows 
         " the robot, its load or its temperature was not the same in all"
     )
     return Follows(text, most)
+
+
+def follows_own_motion(problem: Problem, step: Step, joint: int) -> bool:
+    """Whether smooth functions of a joint's motion, fitted to a recording alone, foretell a part of what is left there.
+
+    The constant of a recording is none of that: beside it nothing follows the motion that others do not have as well.
+    """
+    rows, white = plain_rows(problem, step.state), np.ones((len(problem.records.omega), problem.model.nv))
+    residual, given = rows.y[joint] - rows.X.dense(0)[joint] @ step.state.theta, dependences(step.state.motion, joint)
+    own = {kind: rows_at(problem, step.state, functions, white, joint) for kind, functions in given.items()}
+    for _, used in fitted_recordings(problem, rows.block):
+        at = used & (rows.y[joint] != 0)
+        y, slices = residual[at], rows.block[at] % FOLDS
+        for functions in own.values():
+            F = np.vstack([np.ones(len(y)), functions[:, at]]).T
+            if np.mean((y - foretold_by_others(y, F, slices)) ** 2) < (1 - OF_ONE) * np.var(y):
+                return True
+    return False
 
 
 def _of_ends(problem: Problem, X: JointRows) -> Float[np.ndarray, "nv T k"]:

@@ -33,7 +33,7 @@ from ..simulators.registry import backend as make_backend
 from .answer_fit import as_moves, as_predicts_best, as_weighed_in_motion, as_weighed_otherwise, together
 from .believed import impossible_links
 from .causes import UNSURE, searched_causes, told_size
-from .constancy import of_one_recording, recordings_that_differ
+from .constancy import follows_own_motion, of_one_recording, recordings_that_differ
 from .estimates import estimates, fitted_model
 from .experiment import next_experiment
 from .explain import explain
@@ -174,8 +174,9 @@ def _of_own_zeros(
     of a rest, or of a load or friction that only some recordings have. `measured` has the torques as they were."""
     answer, here, step = one
     problem, joints = here.problem, here.problem.model.dof_names
-    rest = answer.verdict in ("unknown", "named+rest")
-    if (rest and not all(z.certain for z in zeros)) or of_one_recording(problem, step, tolerance):
+    if not all(z.certain and not follows_own_motion(problem, step, z.joint) for z in zeros):
+        return None
+    if of_one_recording(problem, step, tolerance):
         return None
     problem = replace(problem, records=eqx.tree_at(lambda r: r.torque, problem.records, measured.records.torque))
     first = stand(problem, here.start, here.whitening)

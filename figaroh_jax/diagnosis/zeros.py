@@ -27,9 +27,7 @@ __all__ = ["EFFECT", "Zeros", "as_causes", "gain_of", "shifted", "unexplained", 
 
 SURE_P = 1e-4  # chance that constants of quarters of the recordings differ as much as those of the recordings do
 APART = 25.0  # their squares over those that the quarters foretell: noise as slow as a recording made 10 at most
-FAR_APART = (
-    1000.0  # times: a tool or friction that only some recordings have, of a fifth of the torque, made 94 at most
-)
+FAR_APART = 100.0  # times, for a name: a tool or friction that only some have made 94 at most, of a fifth of the torque
 RIDGE = 1e-9  # of the diagonal: columns that no row shows, or that are the same
 EFFECT = "torque_offset"
 
@@ -47,7 +45,7 @@ class Zeros(NamedTuple):
 
     @property
     def certain(self) -> bool:
-        """Whether nothing that follows the motion makes them as sure."""
+        """Whether what follows the motion seldom makes them as sure."""
         return self.ratio > FAR_APART
 
     @property
