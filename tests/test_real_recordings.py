@@ -5,6 +5,7 @@ Which effects a real robot has nobody knows; what its model predicts of motion t
 
 from __future__ import annotations
 
+import re
 import sys
 from itertools import combinations
 from pathlib import Path
@@ -130,6 +131,29 @@ def test_a_spring_that_the_second_of_two_runs_has_alone_is_no_noise(data_dir: Pa
     assert any("the torque of lwr_2_joint is another one" in note for note in changed.notes), changed.notes
     assert changed.verdict in ("unknown", "named+rest")
     assert "the torque of lwr_2_joint is another one" in changed.rest.text
+
+
+@pytest.mark.slow
+def test_a_zero_that_the_second_of_two_runs_has_alone_is_told(data_dir: Path, tmp_path: Path) -> None:
+    """A KUKA's two runs, the torque of the fourth joint zeroed anew for the second: told, and no other name for it."""
+    from benchmarks.hide_in_real.recordings import SETS as REAL
+
+    cases, run = tmp_path / "cases", tmp_path / "run"
+    run.mkdir()
+    path = blackbox.write_task(cases, run, twin_of(cases, REAL["kuka"]()))
+    (second,) = run.glob("*measurements_2*.npz")
+    with np.load(second) as read:
+        arrays = dict(read)
+    by = np.random.default_rng().uniform(0.15, 0.25) * arrays["tau"][:, 3].std()
+    arrays["tau"][:, 3] += by
+    np.savez(second, **arrays)
+    found = diagnose_task(load_task(path))
+    (note,) = [note for note in found.notes if "does not have one constant" in note]
+    assert note.startswith("the torque of lwr_3_joint") and found.verdict in ("unknown", "named+rest")
+    (low, half), (high, _) = [map(float, x) for x in re.findall(r"([+-][\d.e-]+) \+- ([\d.e-]+) N m", note)]
+    assert high - low == pytest.approx(by, abs=2 * half + 0.1 * by)
+    at = {(c.name.effect, c.name.at) for c in found.causes if "lwr_3_joint" in c.name.at}
+    assert at <= {("torque_offset", ("lwr_3_joint",))}
 
 
 @pytest.mark.slow
