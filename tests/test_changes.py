@@ -146,7 +146,7 @@ def test_a_tool_in_half_of_the_recordings_is_not_nothing(seed: int):
 def constants_told(found: Diagnosis) -> dict[str, tuple[float, float]]:
     """By recording, of the one joint of which an answer says that they differ."""
     (note,) = [note for note in found.notes if "does not have one constant in all recordings" in note]
-    number = r"([+-][\d.e-]+) \+- ([\d.e-]+) N m \(or N\) in (\w+)"
+    number = r"([+-][\d.e-]+) \+- ([\d.e-]+) N(?: m)? in (\w+)"
     return {name: (float(value), float(half)) for value, half, name in re.findall(number, note)}
 
 

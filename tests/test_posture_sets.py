@@ -10,6 +10,10 @@ import pytest
 from generators import posture_sets
 from test_kinematic_diagnosis import study
 
+from figaroh_jax.calibration.changes import with_own_frames
+from figaroh_jax.estimation.posegroups import shared
+from figaroh_jax.recordings.poses import PoseRecording
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -34,6 +38,15 @@ def test_a_marker_that_was_moved_between_recordings_is_told_and_no_posture_is_an
     assert (found.verdict, found.causes) == ("unknown", ()), found.causes
     place = f"in run{len(case.recordings) - 1} the device or its marker"
     assert any(place in note and "tool_frame" in note for note in told(found)), told(found)
+
+
+def test_the_first_recording_gets_frames_of_its_own_as_any_other():
+    """With 0 as the number of its group it was one with the others, whose frames are told by False."""
+    q, poses = np.zeros((4, 2)), np.broadcast_to(np.eye(4), (4, 4, 4))
+    device = ("pose", poses, "base", "tool", ("base",))
+    made = [PoseRecording(f"run{k}", Path(f"run{k}.csv"), np.arange(4.0), q, *device) for k in range(3)]
+    for k in range(3):
+        assert sorted(map(sorted, shared(with_own_frames(made, k)))) == sorted([[k], [j for j in range(3) if j != k]])
 
 
 def test_a_joint_that_lost_its_zero_between_recordings_is_named_with_both(folder: Path):

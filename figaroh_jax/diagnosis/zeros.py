@@ -10,9 +10,11 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Bool, Float
 
+from ..effects.base import joint_unit
 from ..effects.catalogue import related
 from ..recordings.signals import Signals
 from ..results import Cause, Diagnosis, Estimate, Gain, Name, Verdict
+from ..rigid.model import prismatic
 from .constancy import fitted_recordings, shown_of_many
 from .flexible import dependences
 from .holdout import kept_out_error, predicted
@@ -40,6 +42,7 @@ class Zeros(NamedTuple):
     value: Float[np.ndarray, " recordings"]  # what each has more than the mean of all rows, N m or N
     deviation: Float[np.ndarray, " recordings"]  # standard deviation, N m or N
     others: Float[np.ndarray, "recordings quarters"]  # `value` as all but one quarter of a recording tell it
+    unit: str
     ratio: float  # their squares over those that the scatter of quarters foretells
     p_value: float
 
@@ -54,7 +57,7 @@ class Zeros(NamedTuple):
         squares = float(np.mean(self.value**2))
         size = float(np.sqrt(max(squares - np.mean(self.deviation**2), 0.0)))
         chance = float(np.sqrt(np.sum((self.value * self.deviation) ** 2) / squares)) / len(self.value)
-        return Estimate(size, chance, "N m")
+        return Estimate(size, chance, self.unit)
 
 
 def zeros_that_differ(problem: Problem, start: State, tolerance: float) -> tuple[Zeros, ...]:
@@ -64,12 +67,12 @@ def zeros_that_differ(problem: Problem, start: State, tolerance: float) -> tuple
     smooth functions of the joint's own position, velocity and load: what makes another torque in another posture is
     none of theirs. Noise that is as slow as a recording is long differs between its quarters as well.
     """
-    step, white = weighed_by_residual(problem, start)
-    recordings = list(fitted_recordings(problem, step.rows.block))
-    size = np.sqrt(np.mean(problem.torque**2, axis=(0, 1)))
+    recordings = list(fitted_recordings(problem, problem.layout.block))
     if len(recordings) < 2:
         return ()
-    out, numbers = [], tuple(number for number, _ in recordings)
+    size = np.sqrt(np.mean(problem.torque**2, axis=(0, 1)))
+    step, white = weighed_by_residual(problem, start)
+    out, numbers, slides = [], tuple(number for number, _ in recordings), prismatic(problem.model)
     for joint in np.flatnonzero(size > 0).tolist():
         there = [used & (step.rows.y[joint] != 0) for _, used in recordings]
         count = np.array([used.sum() for used in there])
@@ -80,7 +83,8 @@ def zeros_that_differ(problem: Problem, start: State, tolerance: float) -> tuple
         ratio = squares / max(foretold, 1e-300)
         chance = len(size) * float(scipy.stats.f.sf(ratio, len(count) - 1, (QUARTERS - 1) * len(count)))
         if ratio > APART and chance < SURE_P and np.sqrt(squares / count.sum()) > tolerance * size[joint]:
-            out.append(Zeros(joint, numbers, value, deviation, others, ratio, chance))
+            unit = joint_unit("N m", slides[joint])
+            out.append(Zeros(joint, numbers, value, deviation, others, unit, ratio, chance))
     return tuple(out)
 
 
@@ -151,8 +155,9 @@ def told(one: Zeros, joints: Sequence[str], names: Sequence[str]) -> str:
 
 
 def _each(one: Zeros, names: Sequence[str]) -> str:
+    """What each recording has beside the mean, in words; of many, those at the ends."""
     each = ", ".join(
-        f"{one.value[k]:+.3g} +- {1.96 * one.deviation[k]:.2g} N m (or N) in {names[one.recordings[k]]}"
+        f"{one.value[k]:+.3g} +- {1.96 * one.deviation[k]:.2g} {one.unit} in {names[one.recordings[k]]}"
         for k in shown_of_many(one.value)
     )
     return f"beside the mean {each}"

@@ -132,7 +132,7 @@ def shared(recordings: Sequence[PoseRecording]) -> list[list[int]]:
     groups: dict[Any, list[int]] = {}
     for k, r in enumerate(recordings):
         markers = r.values.shape[1] if r.kind == "position" else 0
-        same = r.kind, r.base_frame, r.tool_frame, r.unknown, markers, id(r.device), r.carried, r.apart and k
+        same = r.kind, r.base_frame, r.tool_frame, r.unknown, markers, id(r.device), r.carried, k if r.apart else -1
         groups.setdefault(same, []).append(k)
     return list(groups.values())
 
