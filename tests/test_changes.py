@@ -172,6 +172,7 @@ def test_a_torque_that_was_zeroed_anew_is_named_with_each_constant(differs: str,
     (effect,) = [one for one in effects if one["effect"] == "torque_offset"]
     assert effect["parameters"]["offset"]["value"] == pytest.approx(found.causes[0].parameters["offset"].value)
     forbidden = answer(case, forbid=["torque_offset"]) if differs == "repeat" else None
+    assert [name.effect for name in found.causes[0].ambiguous_with] == ["asymmetric_coulomb_friction"]
     assert not forbidden or (forbidden.verdict == "unknown" and "does not have one constant" in forbidden.rest.text)
 
 

@@ -175,6 +175,7 @@ class Inner(NamedTuple):
 
     @classmethod
     def make(cls, measured, linear, inner: Posterior, rows, fold, free, Z) -> Inner:
+        """The fold of which the postures `fold` are left out, of the fit `inner` to `rows`; `Z` are the candidates."""
         weight = np.where(linear.posture >= 0, inner.weight[linear.posture], 1.0)
         scale = np.sqrt(weight) / inner.noise[linear.channel]
         fit, out = np.flatnonzero(rows), np.flatnonzero(measured.measured & np.isin(measured.posture, fold))
@@ -211,6 +212,7 @@ class Inner(NamedTuple):
         return np.sum(pull * np.linalg.solve(normal, pull[..., None])[..., 0], axis=1)
 
     def error(self, which: Array) -> list[Array]:
+        """Errors of what is left out, with the candidates `which` fitted: of points (m), then of orientations (rad)."""
         residual = self.residual[1] + (self.columns[1][:, which] @ self.solve(which)[0] if len(which) else 0.0)
         channel, item, count = self.shape
         parts = []

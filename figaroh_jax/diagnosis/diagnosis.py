@@ -151,7 +151,7 @@ def diagnose(
         if zeros and EFFECT not in forbid:
             moved = shifted(signals, zeros)
             one = answer_to(moved, begun_with(backend, moved, known, trust))
-            answer = _of_own_zeros(one, zeros, begun[0], [s.name for s in signals], tolerance)
+            answer = _of_own_zeros(one, zeros, begun[0], [s.name for s in signals], forbid, tolerance)
         if answer is None:
             answer = answer_to(signals, begun).answer
             answer = unexplained(answer, zeros, backend.robot.dof_names, [s.name for s in signals])
@@ -168,20 +168,25 @@ class _Answered(NamedTuple):
 
 
 def _of_own_zeros(
-    one: _Answered, zeros: Sequence[Zeros], measured: Problem, names: Sequence[str], tolerance: float
+    one: _Answered,
+    zeros: Sequence[Zeros],
+    measured: Problem,
+    names: Sequence[str],
+    forbid: Sequence[str],
+    tolerance: float,
 ) -> Diagnosis | None:
     """The answer to recordings that were shifted, with the constants by which they were; None where these may be a part
     of a rest, or of a load or friction that only some recordings have. `measured` has the torques as they were."""
     answer, here, step = one
     problem, joints = here.problem, here.problem.model.dof_names
-    if not all(z.certain and not follows_own_motion(problem, step, z.joint) for z in zeros):
+    if answer.rest.contradicts or not all(z.certain and not follows_own_motion(problem, step, z.joint) for z in zeros):
         return None
     if of_one_recording(problem, step, tolerance):
         return None
     problem = replace(problem, records=eqx.tree_at(lambda r: r.torque, problem.records, measured.records.torque))
     first = stand(problem, here.start, here.whitening)
     gains = [gain_of(here.problem, step, [z]) for z in zeros]
-    answer = as_causes(answer, zeros, gains, joints, names)
+    answer = as_causes(answer, zeros, gains, joints, names, forbid)
     holdout = answer.holdout
     if not problem.held.any():  # of recordings kept out no constant is known
         after = gain_of(here.problem, step, zeros).after

@@ -164,13 +164,21 @@ def _each(one: Zeros, names: Sequence[str]) -> str:
 
 
 def as_causes(
-    answer: Diagnosis, zeros: Sequence[Zeros], gains: Sequence[Gain], joints: Sequence[str], names: Sequence[str]
+    answer: Diagnosis,
+    zeros: Sequence[Zeros],
+    gains: Sequence[Gain],
+    joints: Sequence[str],
+    names: Sequence[str],
+    forbid: Sequence[str] = (),
 ) -> Diagnosis:
-    """The answer to recordings that were `shifted`, with the constants as causes."""
+    """The answer to recordings that were `shifted`, with the constants as causes; `forbid` names what may not be said
+    to be alike."""
     causes = list(answer.causes)
     for one, gain in zip(zeros, gains, strict=True):
         name = Name(EFFECT, (joints[one.joint],))
-        alike = tuple(Name(other, name.at) for other in related(EFFECT, "indistinguishable_from"))
+        alike = tuple(
+            Name(other, name.at) for other in related(EFFECT, "indistinguishable_from") if other not in forbid
+        )
         same = next((c for c in causes if c.name == name or (c.name in alike and name in c.ambiguous_with)), None)
         numbers = {**(same.parameters if same and same.name == name else {}), "spread": one.spread}
         note = f"the extended model has the mean of all recordings; {_each(one, names)}"
