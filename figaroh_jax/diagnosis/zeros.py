@@ -180,10 +180,12 @@ def as_causes(
             Name(other, name.at) for other in related(EFFECT, "indistinguishable_from") if other not in forbid
         )
         same = next((c for c in causes if c.name == name or (c.name in alike and name in c.ambiguous_with)), None)
-        numbers = {**(same.parameters if same and same.name == name else {}), "spread": one.spread}
         note = f"the extended model has the mean of all recordings; {_each(one, names)}"
-        found = same.found if same else len(causes) + 1
-        cause = Cause(name, numbers, 1 - one.p_value, gain, alike, found, note)
+        if same:  # the mean has a name, that of the model's effect; what looks like the mean alone is no rival
+            numbers, others = {**same.parameters, "spread": one.spread}, [n for n in (name, *alike) if n != same.name]
+            cause = replace(same, parameters=numbers, gain=gain, ambiguous_with=tuple(others), note=note)
+        else:
+            cause = Cause(name, {"spread": one.spread}, 1 - one.p_value, gain, alike, len(causes) + 1, note)
         causes = [c for c in causes if c is not same] + [cause]
     verdict: Verdict = "named" if answer.verdict == "nothing" else answer.verdict
     verdict = "named+rest" if verdict == "unknown" else verdict
