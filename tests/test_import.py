@@ -30,6 +30,15 @@ def test_dynamics_load_no_file_format_backend_or_plot():
     assert run.stdout == run.stderr == ""
 
 
+def test_the_jobs_load_no_distributions():
+    """scipy.stats costs .7 s of every run; its special functions cost nothing more than scipy does."""
+    jobs = "diagnosis", "identification", "postures", "rollouts", "excitation"
+    code = (
+        f"import sys\nfor job in {jobs}: __import__('figaroh_jax.jobs.' + job)\nassert 'scipy.stats' not in sys.modules"
+    )
+    assert _in_new_process(code).stderr == ""
+
+
 def test_reading_a_urdf_loads_no_mesh_library(tmp_path: Path):
     box = "<link name='a'><visual><geometry><box size='1 2 3'/></geometry></visual></link>"
     joint = "<link name='b'/><joint name='j' type='continuous'><parent link='a'/><child link='b'/></joint>"

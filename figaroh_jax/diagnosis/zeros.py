@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.stats
 from jaxtyping import Bool, Float
+from scipy.special import fdtrc
 
 from ..effects.base import joint_unit
 from ..effects.catalogue import related
@@ -81,7 +81,7 @@ def zeros_that_differ(problem: Problem, start: State, tolerance: float) -> tuple
         value, deviation, others = _constants(problem, step, white, joint, there)
         squares, foretold = (float(count @ x**2) for x in (value, deviation))
         ratio = squares / max(foretold, 1e-300)
-        chance = len(size) * float(scipy.stats.f.sf(ratio, len(count) - 1, (QUARTERS - 1) * len(count)))
+        chance = len(size) * float(fdtrc(len(count) - 1, (QUARTERS - 1) * len(count), ratio))
         if ratio > APART and chance < SURE_P and np.sqrt(squares / count.sum()) > tolerance * size[joint]:
             unit = joint_unit("N m", slides[joint])
             out.append(Zeros(joint, numbers, value, deviation, others, unit, ratio, chance))

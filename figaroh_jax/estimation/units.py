@@ -78,12 +78,12 @@ def spreads(
 
 def _one(x: np.ndarray, s: np.ndarray, labels: list[str]) -> tuple:
     """Mean, its std, both spreads, both p values and shrunk values of one parameter."""
-    from scipy.stats import chi2, f
+    from scipy.special import chdtrc, fdtrc
 
     groups = _numbered(labels)
     freedom = len(x) - int(groups.max()) - 1
     days = _paule_mandel(x, s, groups, freedom)
-    p_days = float(chi2.sf(_within(x, s, groups, 0.0), freedom)) if freedom else 1.0
+    p_days = float(chdtrc(freedom, _within(x, s, groups, 0.0))) if freedom else 1.0
     weights = 1 / (s**2 + days**2)
     total = np.bincount(groups, weights)
     means, noise, whole = np.bincount(groups, weights * x) / total, total**-0.5, np.zeros(len(total), int)
@@ -92,7 +92,7 @@ def _one(x: np.ndarray, s: np.ndarray, labels: list[str]) -> tuple:
         squares = _within(means, noise, whole, 0.0)
         count = len(means) - 1
         # a spread between days is known from few days: their degrees of freedom count
-        p_units = float(f.sf(squares / count, count, freedom) if days > 0 else chi2.sf(squares, count))
+        p_units = float(fdtrc(count, freedom, squares / count) if days > 0 else chdtrc(count, squares))
     units = _paule_mandel(means, noise, whole, len(means) - 1)
     weight = 1 / (noise**2 + units**2)
     mean = float(weight @ means / weight.sum())
@@ -124,7 +124,7 @@ def _widening(values: np.ndarray, std: np.ndarray, told: np.ndarray, labels: lis
 
     Above one it takes one standard error of that median with it: too small a factor names what does not differ.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     ratios = []
     for x, s, t in zip(values.T, std.T, told.T, strict=True):
@@ -136,7 +136,7 @@ def _widening(values: np.ndarray, std: np.ndarray, told: np.ndarray, labels: lis
         if freedom < 1:  # one day of each unit: the units themselves
             groups, freedom = np.zeros(len(own), int), len(own) - 1
         if freedom > 0:
-            ratios.append(_within(x[t], s[t], groups, 0.0) / chi2.median(freedom))
+            ratios.append(_within(x[t], s[t], groups, 0.0) / chdtri(freedom, 0.5))
     if len(ratios) < 8:
         return 1.0
     low, middle, high = np.percentile(ratios, (25, 50, 75))

@@ -14,7 +14,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.signal import savgol_filter
 
 from ..compiled.batching import program
 from ..effects.base import Place
@@ -155,6 +154,8 @@ def _carried(loop: Loop, run: Run) -> np.ndarray:
 
 def motion(loop: Loop, run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Position, velocity and acceleration of every joint between each row and the next, (rows, nv) each."""
+    from scipy.signal import savgol_filter  # its distributions are slow to import
+
     n, places = loop.robot.nv, np.array(loop.measured)
     period = regular(run.name, run.time)
     rows = min(max(5, round(_SPAN / period) // 2 * 2 + 1), (len(run.time) - 1) // 2 * 2 + 1)

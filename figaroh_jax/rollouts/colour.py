@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize_scalar
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, ndtri
 
 from .thresholds import BURST, BURST_ROWS, COLOUR, LEAST_OF_A_BAND, LOUDER, LOWEST_CORNER, SHORTEST
 
@@ -118,7 +118,7 @@ def _beyond_bands(frequency: np.ndarray, ratio: np.ndarray) -> float:
     mean = np.bincount(which, ratio, minlength=len(_BANDS)) / np.maximum(count, 1)
     kept = count >= LEAST_OF_A_BAND
     gained = 2 * float((count[kept] * (mean[kept] - 1 - np.log(mean[kept]))).sum())
-    return float(norm.isf(max(chi2.sf(gained, max(kept.sum() - 2, 1)), 1e-300)))
+    return -float(ndtri(max(chdtrc(max(kept.sum() - 2, 1), gained), 1e-300)))
 
 
 def _in_bursts(stretches: list[np.ndarray], pole: float) -> float:

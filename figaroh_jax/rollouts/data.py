@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import correlate
 from scipy.special import gammaincinv
 
 from ..errors import InputError
@@ -141,6 +140,8 @@ def ahead_of_command(command: Float[np.ndarray, " rows"], position: Float[np.nda
 
     Told by the correlation of their steps at every shift: no drive knows its command beforehand.
     """
+    from scipy.signal import correlate  # its distributions are slow to import
+
     steps, moves = np.diff(command), np.diff(position)
     most = min(round(AHEAD_SECONDS / period), len(steps) // 2)
     size = float(np.sqrt((steps @ steps) * (moves @ moves)))

@@ -7,7 +7,6 @@ from typing import cast
 
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import periodogram
 
 from ..results import Dependence, Nearest, Part, Trace
 from .found import Search
@@ -133,5 +132,7 @@ def _line(own: Sequence[Trace], j: int, beyond: float) -> _Share:
 
 
 def _spectrum(one: Trace, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    from scipy.signal import periodogram  # its distributions are slow to import
+
     rate = (len(one.time) - 1) / (one.time[-1] - one.time[0])
     return periodogram(values - values.mean(), rate)
