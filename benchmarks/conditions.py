@@ -3,6 +3,7 @@
     python benchmarks/conditions.py clean --seeds 0 40
     python benchmarks/conditions.py rotor --seeds 0 20     # .03 kg m^2 at the elbow that the URDF does not hold
     python benchmarks/conditions.py foreign --seeds 0 20   # a torque that no effect of the catalogue has
+    python benchmarks/conditions.py tooth --seeds 0 20     # a spot of a gear that is felt in one direction
     python benchmarks/conditions.py clean --strange        # with what a stranger's recording has beside
 
 The torques are MuJoCo C's inverse dynamics, with viscous and dry friction that the baseline fits. Drawn are: seconds,
@@ -165,7 +166,7 @@ def make(folder: Path, seed: int, hidden: str, strange: bool = False) -> tuple[C
     model = _robot(folder, beside)
     model.dof_armature[1] = ROTOR if hidden == "rotor" else 0.0
     viscous, dry = rng.uniform(0.1, 1, 2), rng.uniform(0.2, 2, 2) * told.coulomb
-    waves, lines = motion(rng, told), []
+    waves, lines, spot = motion(rng, told), [], None
     pause = float(other.uniform(0.15, 0.3)) * beside.pauses
     for run in range(told.recordings):
         again = told.repeats and run % 2 == 1
@@ -178,6 +179,9 @@ def make(folder: Path, seed: int, hidden: str, strange: bool = False) -> tuple[C
         tau[:, :2] += viscous * v + dry * np.sign(v)
         if hidden == "foreign":
             tau[:, 1] += 0.15 * tau[:, 1].std() * np.sin(3 * q[:, 0]) * np.tanh(2 * v[:, 1] * q[:, 1])
+        if hidden == "tooth":
+            spot = np.quantile(q[:, 1], np.random.default_rng((seed, 1)).uniform(0.3, 0.7)) if spot is None else spot
+            tau[:, 1] += 0.4 * tau[:, 1].std() * np.exp(-(((q[:, 1] - spot) / 0.06) ** 2)) * (v[:, 1] > 0)
         tau[:, :2] += told.level * tau[:, :2].std(0) * noise(rng, len(t), told.colour)
         if beside.idle:
             q, v = (np.column_stack([x, value * np.ones(len(t))]) for x, value in ((q, 0.4), (v, 0.0)))
@@ -294,7 +298,7 @@ def graded(seed: int, hidden: str, strange: bool = False) -> dict[str, Any]:
 def main() -> None:
     """Diagnose the cases in turn, a line each, and count the verdicts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("hidden", choices=["clean", "rotor", "foreign"])
+    parser.add_argument("hidden", choices=["clean", "rotor", "foreign", "tooth"])
     parser.add_argument("--seeds", nargs=2, type=int, default=[0, 20], metavar=("FIRST", "NUMBER"))
     parser.add_argument("--strange", action="store_true", help="with what a stranger's recording has beside")
     parser.add_argument("--out", type=Path, help="file to which all of each answer is added, a JSON line a case")

@@ -26,7 +26,7 @@ from .naming import LIKE_A_REST, beyond_simpler
 from .rest import (
     beyond_noise,
     excess,
-    follows_others,
+    follows_motion,
     lines,
     predictable,
     relative_rest,
@@ -274,7 +274,7 @@ def _left(
     if not problem.layout.repeats and not found and not there:  # nor is it known how much of what is left is noise
         large = relative_rest(problem, joint.step.state, 0 * noise) > tolerance
         rough = roughly_predictable(problem, joint.step, whitening, tolerance)
-        follows = follows_others(problem, joint.step.state, tolerance)
+        follows = follows_motion(problem, joint.step.state, tolerance, ~resting(problem))
         follows = follows or of_one_recording(problem, joint.step, tolerance)
         left = left._replace(text=follows.text if follows else left.text)
         there = bool((quiet & large).any() or rough.any() or follows)

@@ -48,7 +48,7 @@ from .naming import ONE_PART, lone_part, strong
 from .problem import Problem
 from .reading import Reader, only_read
 from .repeats import repeats_not_said
-from .rest import parts_of, relative_rest, roughly_predictable, tolerated, verdict
+from .rest import follows_motion, parts_of, relative_rest, roughly_predictable, tolerated, verdict
 from .screening import OneMore, noise_squares
 from .search import Found, Search, chance_beside
 from .setting import Setting, begun_with, prepared_signals, setting_beside, setting_of
@@ -238,10 +238,15 @@ def _judged(
     named, joint, problem = gaining.named, gaining.joint, here.problem
     against |= reasons
     nearest = [Nearest(one.name, one.gain, against[one.name]) for one in each if against[one.name]]
+    follows = None
+    if found and not named and not left.rest.there:  # asked beside the causes it was not
+        follows = follows_motion(problem, joint.step.state, tolerance, ~resting(problem))
+    if follows:
+        here = here._replace(spectrum=here.spectrum.at_most(noise_rms(problem, here.spectrum), follows.noise))
     relative = relative_rest(problem, joint.step.state, noise_rms(problem, here.spectrum))
     large = float(relative.max()) > tolerance
-    shown = left.rest.there or ((bool(nearest) or doubted) and large)
-    if shown and not named and not left.rest.there and not doubted and short(problem, joint.step.state):
+    shown = left.rest.there or bool(follows) or ((bool(nearest) or doubted) and large)
+    if shown and not named and not left.rest.there and not follows and not doubted and short(problem, joint.step.state):
         sober = sober_spectrum(problem, joint.step.state, forbid)
         shown = chance_beside(problem, joint.step, sober, here.whitening, forbid, generator) < REST_P
     same = here.whitening is searched.here.whitening
@@ -251,7 +256,8 @@ def _judged(
         law = any(strong(one) and against[one.name] for one in each)  # it moves, whatever it is
         stays = _as_what(searched, here, gaining, by_speed, told, shown, law, reader, tolerance, generator)
     rest, sticks, read = stays
-    text = (left.rest.text or ("" if relative.any() else _LESS_THAN_NOISE)) if rest and shown else ""
+    text = follows.text if follows else left.rest.text
+    text = (text or ("" if relative.any() else _LESS_THAN_NOISE)) if rest and shown else ""
     if rest and named:
         gaining = gaining._replace(joint=_beside_rest(here, named, joint))
     parts = parts_of(problem, told, searched.here.whitening, left.line, [s.name for s in reader.signals])

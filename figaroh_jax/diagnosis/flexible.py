@@ -30,10 +30,12 @@ __all__ = [
     "rich_families",
     "rough_functions",
     "smooth_functions",
+    "table_of_places",
     "to_unit",
 ]
 
 DEGREES = 6  # of the polynomials in a joint's position; of the cosines over time one less
+PLACES = 37  # of a table over the range of a joint
 FINEST = 24  # periods over the range of a joint: a finer ripple of its position is not looked for
 WIDTHS = (0.0, 0.0025, 0.005, 0.01, 0.02, 0.04, 0.08, 0.16)  # rad/s or m/s
 WIDTH_GAIN = 10.0  # whitened squares that a smooth reversal must take away
@@ -269,6 +271,15 @@ def rough_functions(motion: Motion, joint: int) -> list[Float[np.ndarray, "k nN"
     others = [np.asarray(x).T for x in (motion.direction, motion.velocity, motion.acceleration)]
     beside = np.concatenate([np.delete(x, joint, axis=0) for x in others])
     return [*(waves[k : k + 2].reshape(4, -1) for k in range(FINEST - 1)), *([beside] if len(beside) else [])]
+
+
+def table_of_places(motion: Motion, joint: int) -> tuple[Float[np.ndarray, "k nN"], Float[np.ndarray, " k"]]:
+    """A table of a joint's position (rad or m), linear between its places, for motion forwards, then backwards; and the
+    place of each column."""
+    q, v = np.asarray(motion.angle)[:, joint], np.asarray(motion.velocity)[:, joint]
+    knots = np.linspace(q.min(), q.max(), PLACES)
+    near = np.maximum(1 - np.abs(q - knots[:, None]) / max(float(knots[1] - knots[0]), 1e-12), 0.0)
+    return np.concatenate([near * (v > 0), near * (v < 0)]), np.tile(knots, 2)
 
 
 def products(motion: Motion) -> tuple[Float[np.ndarray, "k nN"], list[tuple[int, int, int]]]:

@@ -25,7 +25,7 @@ from .naming import (
     stands_alone,
     stands_out,
 )
-from .rest import Follows, Significance, relative_rest, roughly_predictable
+from .rest import Follows, Significance, relative_rest, roughly_predictable, taken_by_place
 from .search import Found, Search, chance_beside
 from .setting import Setting
 from .standstill import left_weighed, only_sticks, resting
@@ -56,7 +56,7 @@ class Left(NamedTuple):
     misfit: Bool[np.ndarray, " nv"]  # whether, without any cause, they are, or are more than is tolerable
     followed: Float[np.ndarray, " nv"]  # `more` where such functions surely predict what was not fitted, else zero
     moved: Bool[np.ndarray, " nv"]  # `misfit` of the rows in which the joint moves
-    follows: Follows | None = None  # a joint of which it follows other joints
+    follows: Follows | None = None  # a joint of which most of it follows the motion
 
 
 class Searched(NamedTuple):
@@ -110,6 +110,8 @@ def standings_of(searched: Searched) -> list[Standing]:
     """What the data say of each cause, with what is left at its joints."""
     _, here, _, found, joint, left, *_ = searched
     each = standings(here.problem, here.start, found, joint, here.whitening)
+    own = {j for f in found if f.effect.acts_on == "joint" for j in f.joints}
+    placed = {j: taken_by_place(here.problem, joint.step, here.whitening, j) for j in own}
     return [
         replace(
             one,
@@ -118,6 +120,7 @@ def standings_of(searched: Searched) -> list[Standing]:
             alone=stands_alone(left.misfit, f.joints),
             followed=of_its_own(left.followed, f.joints, one.taken) * stands_out(left.followed, f.joints),
             unmoved=stands_alone(left.moved, f.joints),
+            by_place=sum(placed[j] for j in f.joints if f.effect.acts_on == "joint") / max(one.taken, 1e-300),
         )
         for one, f in zip(each, found, strict=True)
     ]

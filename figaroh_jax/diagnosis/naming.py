@@ -41,6 +41,7 @@ from .thresholds import (
     ALL_BUT,
     BESIDE_SMOOTH,
     BUYS,
+    BY_PLACE,
     COUPLED,
     FEWEST_ALIKE,
     GAIN_NAMED,
@@ -112,6 +113,7 @@ class Standing:
     leaves: float = 0.0  # squares beyond noise at its joints over these
     followed: float = 0.0  # squares that smooth functions surely find in what it leaves at its joints, over these
     unmoved: bool = True  # whether no misfit of joints that move but its own is likely
+    by_place: float = 0.0  # squares that a table of its joint's position surely takes of what it leaves, over these
     everywhere: bool = False  # whether a law that acts at all joints at all times may stand in its place
     alone: bool = True  # whether its joints are likely to have no other misfit (`stands_alone`)
     contested: bool = False  # whether another law of the whole robot, one that cannot be, surely takes much beside it
@@ -169,6 +171,11 @@ def _of_all(one: Standing, tolerance: float) -> Iterator[tuple[bool, str]]:
         one.leaves <= LAW_LEAVES or not one.alone,
         f"where it acts {one.leaves:.2f} of what it removes stays beyond the noise, though most other joints have"
         " no misfit: another law acts there",
+    )
+    yield (
+        one.by_place <= BY_PLACE,
+        f"what it leaves goes with the joint's position and direction of motion, by {one.by_place:.2f} of what it"
+        " removes: it is the smaller part of what acts there",
     )
     yield (
         one.followed <= OWN_SHARE or not one.unmoved,

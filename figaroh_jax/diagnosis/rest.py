@@ -8,13 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..effects.base import joint_unit
 from ..estimation import noise
 from ..estimation.noise import Spectrum
-from ..estimation.rows import Linear, Rows
+from ..estimation.rows import UNKNOWN, Linear, Rows
 from ..recordings.stacked import filter_rows
 from ..results import Dependence, Part, Verdict
+from ..rigid.model import prismatic
 from .comparison import ground, judge_grown, t_needed, t_value
-from .flexible import Smooth, dependences, products, rough_functions
+from .flexible import Smooth, dependences, products, rough_functions, table_of_places
 from .holdout import residual_rms
 from .problem import Problem
 from .screening import CHUNK, Group, draw_noise, noise_squares
@@ -43,8 +45,7 @@ __all__ = [
     "Significance",
     "beyond_noise",
     "excess",
-    "Follows",
-    "follows_others",
+    "follows_motion",
     "lines",
     "parts_of",
     "predictable",
@@ -54,6 +55,7 @@ __all__ = [
     "roughly_predictable",
     "rows_at",
     "significance",
+    "taken_by_place",
     "tolerated",
     "verdict",
     "wrong_law",
@@ -253,43 +255,78 @@ def roughly_predictable(
 
 
 class Follows(NamedTuple):
-    """A joint whose residual follows other joints."""
+    """A joint whose residual surely follows the motion, in a way that no cause has."""
 
     text: str
     noise: Float[np.ndarray, " nv"]  # RMS of each joint's rows that may be noise, N m or N; infinite but at this joint
 
 
-def follows_others(problem: Problem, state: State, tolerance: float) -> Follows | None:
-    """What product of two positions or velocities of the robot predicts half of what some joint leaves, on data that it
-    was not fitted to; None without any.
+def follows_motion(
+    problem: Problem, state: State, tolerance: float, moving: Bool[np.ndarray, "n M nv"]
+) -> Follows | None:
+    """What predicts half of what some joint leaves, on data that it was not fitted to; None without any.
 
-    Without repeats a torque that follows other joints passes for slow noise. All rows of a joint count alike: the
-    spectrum of the noise holds what is asked for.
+    Asked are the products of two positions or velocities of the robot, and in the rows where the joint is `moving` a
+    table of its position, one for each direction of motion. Without repeats a torque that follows either passes for
+    slow noise. All rows of a joint count alike: the spectrum of the noise holds what is asked for.
     """
     size = residual_rms(problem, state)
     large = np.flatnonzero(relative_rest(problem, state, np.zeros_like(size)) > tolerance).tolist()
     if problem.layout.repeats or not large:
         return None
     white = np.ones((len(problem.records.omega), 1)) / np.maximum(size, 1e-12 * size.max())
-    step = stand(problem, state, white)
+    step, names = stand(problem, state, white), problem.model.dof_names
     base, (columns, places) = ground(step.verdicts, step.state.prior, step.folded), products(step.state.motion)
+
+    def foretold(joint: int, rows: Float[np.ndarray, "k T"]) -> tuple[float, Float[np.ndarray, " k"]] | None:
+        """Share of the held-out squares that functions leave, and their sizes; None where they do not surely take
+        half."""
+        grown = judge_grown(step.rows, base, (joint,), rows[:, None])
+        worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, grown))
+        surely = t_value(worse, better) > t_needed(len(worse), T_REST, len(large))
+        half = surely and better.sum() < (1 - FOLLOWS) * worse.sum()
+        return (float(better.sum() / worse.sum()), grown.theta[-len(rows) :]) if half else None
+
+    def told(joint: int, left: float, what: str) -> Follows:
+        most = np.full(len(size), np.inf)
+        most[joint] = size[joint] * np.sqrt(left)
+        return Follows(f"{100 * (1 - left):.3g} % of what {names[joint]} leaves goes with {what}", most)
+
     for joint in large:
         rows = rows_at(problem, step.state, columns, white, joint)
         across, pull = step.rows.X.pulled_at((joint,), rows[:, None]).T, rows @ step.verdicts.residual[joint]
         gram = rows @ rows.T - across.T @ base.inverse[-1] @ across
         taken = [pull[at] @ np.linalg.lstsq(gram[np.ix_(at, at)], pull[at], rcond=None)[0] for at in map(list, places)]
-        best, names = list(places[int(np.argmax(taken))]), problem.model.dof_names
-        grown = judge_grown(step.rows, base, (joint,), rows[best][:, None])
-        worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, grown))
-        surely = t_value(worse, better) > t_needed(len(worse), T_REST, len(large))
-        if surely and better.sum() < (1 - FOLLOWS) * worse.sum():
-            what = [f"{('position', 'velocity')[k // len(names)]} of {names[k % len(names)]}" for k in best[:2]]
-            left = float(better.sum() / worse.sum())
-            text = f"{100 * (1 - left):.3g} % of what {names[joint]} leaves goes with the {what[0]} times the {what[1]}"
-            most = np.full(len(size), np.inf)
-            most[joint] = size[joint] * np.sqrt(left)
-            return Follows(text, most)
+        best = list(places[int(np.argmax(taken))])
+        if found := foretold(joint, rows[best]):
+            one, other = (
+                f"the {('position', 'velocity')[k // len(names)]} of {names[k % len(names)]}" for k in best[:2]
+            )
+            return told(joint, found[0], f"{one} times {other}")
+        table, at = table_of_places(step.state.motion, joint)
+        rows = rows_at(problem, step.state, table, white, joint) * moving[:, :, joint].reshape(-1)
+        # each number of a size of about that of what is left: a fold without data of a place knows nothing of it
+        if found := foretold(joint, np.sqrt(UNKNOWN) * rows):
+            most = int(np.argmax(np.abs(found[1])))
+            way, unit = (
+                ("forwards", "backwards")[most >= len(at) // 2],
+                joint_unit("rad", prismatic(problem.model)[joint]),
+            )
+            return told(joint, found[0], f"its position while it moves {way}, most at {at[most]:.3g} {unit}")
     return None
+
+
+def taken_by_place(problem: Problem, step: Step, whitening: Float[np.ndarray, "F nv"], joint: int) -> float:
+    """Held-out squares that a table of a joint's position, for each direction of motion, surely takes of what is left.
+
+    Zero where it does not surely predict them.
+    """
+    table = rows_at(problem, step.state, table_of_places(step.state.motion, joint)[0], whitening, joint)
+    base, left = ground(step.verdicts, step.state.prior, step.folded), step.verdicts.residual[joint]
+    table *= np.sqrt(UNKNOWN * np.mean(left**2))  # numbers of about the size of what is left, as in `follows_motion`
+    grown = judge_grown(step.rows, base, (joint,), table[:, None])
+    worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, grown))
+    return max(float((worse - better).sum()), 0.0) if t_value(worse, better) > T_REST else 0.0
 
 
 def parts_of(
