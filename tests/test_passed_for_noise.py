@@ -14,6 +14,7 @@ from generators.case import Case
 from generators.inverse import draw_case, make_case, record_case
 
 import figaroh_jax as fj
+from benchmarks.conditions import graded
 from benchmarks.hide_and_name.stiction import make_stiction_case
 
 needs_robots = pytest.mark.skipif(not robots.available("tx40"), reason="FIGAROH_JAX_DATA has no staubli_tx40")
@@ -142,6 +143,29 @@ def test_a_torque_that_follows_other_joints_is_not_told_as_noise(robot: str):
 
 
 @needs_robots
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["tx40", "panda"])
+def test_a_spot_that_a_joint_feels_in_one_direction_has_no_name(robot: str):
+    """One damaged tooth was `nothing`, within a noise that was told twice as large as all that is left."""
+    if not robots.available(robot):
+        pytest.skip(f"FIGAROH_JAX_DATA has no {robot}")
+    seed = secrets.randbits(31)
+    hidden = make_case([("sticky_tooth", 0.1)], robot, 1, 4, 1.0, seed, encoder_step=1e-5)
+    found, (truth,) = diagnosed(hidden), hidden.truth
+    assert found.verdict == "unknown", seed
+    assert found.rest.relative.argmax() == found.joints.index(truth.at[0]), seed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [40014, 40027, 40030, 40036])
+def test_a_spot_of_a_gear_is_no_ripple_and_no_gain_of_the_joint_beside(seed: int):
+    """Two ripples, one ripple, `nothing`, and a gain of the other joint were the answers."""
+    answer = graded(seed, "tooth")
+    assert answer["grade"] == "unknown", answer["names"]
+    if seed == 40030:  # short of a large noise: only the place says that it is none
+        assert "% of what elbow leaves goes with its position while it moves forwards, most at " in answer["text"]
+
+
 @pytest.mark.slow
 def test_friction_that_a_law_turns_down_is_no_friction():
     """A drive at its limit, which the catalogue lacked, was a power law that lost a fifth of joint 6's friction again

@@ -41,7 +41,16 @@ from .floor import noise_rms, short, sober_spectrum, undecided
 from .gaining import Gaining, without_losses
 from .holdout import relative_error, residual_rms, traces
 from .joint import Joint, least_sure, opened, with_rest, without_a_number
-from .judgement import KeptOut, Searched, as_slow_noise, doubted_rest, reasons_against, standings_of, sticks_alone
+from .judgement import (
+    KeptOut,
+    Searched,
+    as_slow_noise,
+    doubted_rest,
+    made_by_other_joints,
+    reasons_against,
+    standings_of,
+    sticks_alone,
+)
 from .layout import describe_folds
 from .links import as_gain, moved_links
 from .naming import ONE_PART, lone_part, strong
@@ -225,6 +234,7 @@ def _judged(
     kept_out = KeptOut(searched, {one.name: one.gain for one in each})
     doubted = doubted_rest(searched, forbid, generator)
     against = reasons_against(searched, each, kept_out, doubted, tolerance)
+    against |= made_by_other_joints(searched, each, against)
     if contradictions:
         against = {name: why or "nothing is named before what looks wrong is settled" for name, why in against.items()}
     named = [f for f in found if not against[f.name]]

@@ -13,6 +13,7 @@ from ..results import Name, Nearest
 from .answer_fit import together
 from .floor import noise_rms, short, sober_spectrum
 from .gaining import Fall, beside_all, foretells
+from .holdout import residual_rms
 from .joint import Joint
 from .naming import (
     Standing,
@@ -29,8 +30,8 @@ from .rest import Follows, Significance, relative_rest, roughly_predictable, tak
 from .search import Found, Search, chance_beside
 from .setting import Setting
 from .standstill import left_weighed, only_sticks, resting
-from .step import stand
-from .thresholds import ALL_BUT, NO_REST, REST_P, SURE_DROP
+from .step import stand, with_causes
+from .thresholds import ALL_BUT, NO_REST, REST_P, SURE_DROP, WEIGHED_ALIKE
 
 __all__ = [
     "KeptOut",
@@ -38,6 +39,7 @@ __all__ = [
     "Searched",
     "as_slow_noise",
     "doubted_rest",
+    "made_by_other_joints",
     "reasons_against",
     "standings_of",
     "sticks_alone",
@@ -183,6 +185,33 @@ def reasons_against(
         if not any(against[one.name] and one.share >= tolerance for one in each):
             return against
     return refused(each)
+
+
+def made_by_other_joints(searched: Searched, each: Sequence[Standing], against: dict[Name, str]) -> dict[Name, str]:
+    """Why a cause that nothing speaks `against` may be what another joint leaves, where it may.
+
+    Rows as sure as the noise of their joint's sensor hold a misfit there as firmly as the truth: links that are fitted
+    to it are wrong at the joints beside, and a cause of these takes that back. Weighed by what it leaves of its own
+    joints, a misfit holds no link.
+    """
+    here, joint, found = searched.here, searched.joint, searched.found
+    asked = [k for k, f in enumerate(found) if not against[f.name] and not each[k].whole]
+    if not asked or not searched.strict or here.white:
+        return {}
+    problem, size = here.problem, residual_rms(here.problem, joint.step.state)
+    white = np.ones((len(problem.records.omega), 1)) / np.maximum(size, 1e-12 * size.max())
+    whole, out = with_causes(problem, here.start, list(joint.causes), white), {}
+    for k in asked:
+        one, others = found[k], [effect for n, effect in enumerate(joint.causes) if n != k]
+        step = with_causes(problem, here.start, others, white)
+        worse, better = (s.verdicts.own(whole.rows, one.joints).sum() for s in (step, whole))
+        gain = 1 - float(better / max(worse, 1e-300))
+        if gain < WEIGHED_ALIKE * each[k].gain:
+            out[one.name] = (
+                f"it removes {100 * each[k].gain:.0f} % of the held-out error where it acts, {100 * gain:.0f} % with"
+                " each joint weighed by what it leaves: what is wrong at another joint may have made it"
+            )
+    return out
 
 
 def as_slow_noise(

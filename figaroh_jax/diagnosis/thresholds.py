@@ -105,6 +105,7 @@ LEAST_SHARE = 0.05  # of the power beyond the noise: a dependence that is told
 FEW_CAUSES = 3  # found together: beyond, the model is wrong in more ways than one, and a stand-in more likely
 NO_REST = 0.15  # excess over the noise up to which a cause need only be there to be named
 FOR_SURE = 3  # times FEW_CAUSES: of so many that a search finds, more than a few are left in one fit
+WEIGHED_ALIKE = 0.3  # of its gain, that a cause of a joint keeps where each joint counts by what it leaves
 BY_PLACE = 1.0  # of what a cause of a joint has removed: a table of the position that takes more is no part of it
 OWN_SHARE = 0.03  # of what a cause has removed: a rest at its own place that speaks against its law
 STANDSTILL = 0.08  # of a joint's top speed: rows at and around rest
