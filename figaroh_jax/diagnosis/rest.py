@@ -279,8 +279,7 @@ def follows_motion(
     base, (columns, places) = ground(step.verdicts, step.state.prior, step.folded), products(step.state.motion)
 
     def foretold(joint: int, rows: Float[np.ndarray, "k T"]) -> tuple[float, Float[np.ndarray, " k"]] | None:
-        """Share of the held-out squares that functions leave, and their sizes; None where they do not surely take
-        half."""
+        """Share of the held-out squares that functions leave, and their sizes; None where half is not surely taken."""
         grown = judge_grown(step.rows, base, (joint,), rows[:, None])
         worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, grown))
         surely = t_value(worse, better) > t_needed(len(worse), T_REST, len(large))
@@ -299,20 +298,16 @@ def follows_motion(
         taken = [pull[at] @ np.linalg.lstsq(gram[np.ix_(at, at)], pull[at], rcond=None)[0] for at in map(list, places)]
         best = list(places[int(np.argmax(taken))])
         if found := foretold(joint, rows[best]):
-            one, other = (
-                f"the {('position', 'velocity')[k // len(names)]} of {names[k % len(names)]}" for k in best[:2]
-            )
-            return told(joint, found[0], f"{one} times {other}")
+            what = [f"the {('position', 'velocity')[k // len(names)]} of {names[k % len(names)]}" for k in best[:2]]
+            return told(joint, found[0], " times ".join(what))
         table, at = table_of_places(step.state.motion, joint)
         rows = rows_at(problem, step.state, table, white, joint) * moving[:, :, joint].reshape(-1)
         # each number of a size of about that of what is left: a fold without data of a place knows nothing of it
         if found := foretold(joint, np.sqrt(UNKNOWN) * rows):
             most = int(np.argmax(np.abs(found[1])))
-            way, unit = (
-                ("forwards", "backwards")[most >= len(at) // 2],
-                joint_unit("rad", prismatic(problem.model)[joint]),
-            )
-            return told(joint, found[0], f"its position while it moves {way}, most at {at[most]:.3g} {unit}")
+            where = f"{at[most]:.3g} {joint_unit('rad', prismatic(problem.model)[joint])}"
+            way = ("forwards", "backwards")[most >= len(at) // 2]
+            return told(joint, found[0], f"its position while it moves {way}, most at {where}")
     return None
 
 
@@ -322,8 +317,9 @@ def taken_by_place(problem: Problem, step: Step, whitening: Float[np.ndarray, "F
     Zero where it does not surely predict them.
     """
     table = rows_at(problem, step.state, table_of_places(step.state.motion, joint)[0], whitening, joint)
-    base, left = ground(step.verdicts, step.state.prior, step.folded), step.verdicts.residual[joint]
-    table *= np.sqrt(UNKNOWN * np.mean(left**2))  # numbers of about the size of what is left, as in `follows_motion`
+    base = ground(step.verdicts, step.state.prior, step.folded)
+    # numbers of about the size of what is left, as in `follows_motion`
+    table = np.sqrt(UNKNOWN) * float(residual_rms(problem, step.state)[joint]) * table
     grown = judge_grown(step.rows, base, (joint,), table[:, None])
     worse, better = (v.own(step.rows, (joint,)) for v in (step.verdicts, grown))
     return max(float((worse - better).sum()), 0.0) if t_value(worse, better) > T_REST else 0.0
