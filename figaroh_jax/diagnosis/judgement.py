@@ -112,7 +112,7 @@ def standings_of(searched: Searched) -> list[Standing]:
     """What the data say of each cause, with what is left at its joints."""
     _, here, _, found, joint, left, *_ = searched
     each = standings(here.problem, here.start, found, joint, here.whitening)
-    own = {j for f in found if f.effect.acts_on == "joint" for j in f.joints}
+    own = {j for f in found if f.effect.waves for j in f.joints}
     placed = {j: taken_by_place(here.problem, joint.step, here.whitening, j) for j in own}
     return [
         replace(
@@ -122,7 +122,7 @@ def standings_of(searched: Searched) -> list[Standing]:
             alone=stands_alone(left.misfit, f.joints),
             followed=of_its_own(left.followed, f.joints, one.taken) * stands_out(left.followed, f.joints),
             unmoved=stands_alone(left.moved, f.joints),
-            by_place=sum(placed[j] for j in f.joints if f.effect.acts_on == "joint") / max(one.taken, 1e-300),
+            by_place=sum(placed[j] for j in f.joints if f.effect.waves) / max(one.taken, 1e-300),
         )
         for one, f in zip(each, found, strict=True)
     ]

@@ -332,6 +332,7 @@ class Effect(eqx.Module):
     speed_law: ClassVar[bool] = False  # whether it is a law of dry friction over the speed, one of several alike
     bends: ClassVar[bool] = False  # whether it may bend what viscous friction makes rise, but not turn it down
     of_position: ClassVar[bool] = False  # whether it follows the position of its joint alone, as weight may
+    waves: ClassVar[bool] = False  # whether it rises and falls along its joint's position: a spot looks like some of it
     beside_rest: ClassVar[bool] = True  # whether it can be told from a rest that stays; no law of what any rest does
     fades: ClassVar[bool] = False  # whether it goes by the time since the start: another recording has it no more
     vanishes: ClassVar[tuple[str, ...]] = ()  # shapes at whose zero it adds nothing, whatever its amplitudes

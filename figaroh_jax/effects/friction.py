@@ -192,6 +192,7 @@ class PositionDependentFriction(JointEffect):
     name, title = "position_dependent_friction", "position-dependent friction"
     levels = ("torque", "pose")  # in rollouts it acts where a model has it, but is not looked for
     rubs = True
+    waves = True
     equation = "s(v) (cosine cos q + sine sin q)"
     separated_by = "the same motion of {at} in other postures of the other joints"
     cosine: Scalar = amplitude("N m")

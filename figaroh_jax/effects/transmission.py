@@ -98,6 +98,7 @@ class TorqueRipple(JointEffect):
 
     name, title = "torque_ripple", "torque ripple"
     reverses = False
+    waves = True
     equation = "sine sin(order q) + cosine cos(order q)"
     separated_by = "sweeps of {at} at two constant speeds: the order stays, the frequency moves"
     in_rollouts = InRollouts(
