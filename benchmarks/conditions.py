@@ -4,6 +4,8 @@
     python benchmarks/conditions.py rotor --seeds 0 20     # .03 kg m^2 at the elbow that the URDF does not hold
     python benchmarks/conditions.py foreign --seeds 0 20   # a torque that no effect of the catalogue has
     python benchmarks/conditions.py tooth --seeds 0 20     # a spot of a gear that is felt in one direction
+    python benchmarks/conditions.py carried --seeds 0 20   # a body that is gripped and let go in each recording
+    python benchmarks/conditions.py pushed --seeds 0 20    # a push at the forearm's tip, once in each recording
     python benchmarks/conditions.py clean --strange        # with what a stranger's recording has beside
 
 The torques are MuJoCo C's inverse dynamics, with viscous and dry friction that the baseline fits. Drawn are: seconds,
@@ -40,6 +42,7 @@ JOINT = (
 FIXED = '<joint name="{}" type="fixed"><parent link="{}"/><child link="{}"/><origin xyz="{}" rpy="{}"/></joint>'
 ROTOR = 0.03  # kg m^2
 MOTOR = 2.5  # N m an A
+LOAD = (0.7, "0.3 0 0.05")  # kg; m in the forearm's frame
 WAVES = 6  # harmonics of a motion
 
 
@@ -182,6 +185,8 @@ def make(folder: Path, seed: int, hidden: str, strange: bool = False) -> tuple[C
         if hidden == "tooth":
             spot = np.quantile(q[:, 1], np.random.default_rng((seed, 1)).uniform(0.3, 0.7)) if spot is None else spot
             tau[:, 1] += 0.4 * tau[:, 1].std() * np.exp(-(((q[:, 1] - spot) / 0.06) ** 2)) * (v[:, 1] > 0)
+        if hidden in ("carried", "pushed"):
+            tau[:, :2] += _held(folder, hidden, np.random.default_rng((seed, 2, run)), t / told.seconds, (q, v, a))
         tau[:, :2] += told.level * tau[:, :2].std(0) * noise(rng, len(t), told.colour)
         if beside.idle:
             q, v = (np.column_stack([x, value * np.ones(len(t))]) for x, value in ((q, 0.4), (v, 0.0)))
@@ -204,8 +209,8 @@ def make(folder: Path, seed: int, hidden: str, strange: bool = False) -> tuple[C
     return told, beside
 
 
-def _robot(folder: Path, beside: Strange) -> Any:
-    """The URDF that the task names, and the MuJoCo model of the true robot."""
+def _robot(folder: Path, beside: Strange, load: float = LOAD[0]) -> Any:
+    """The URDF that the task names, and the MuJoCo model of the true robot (`load`, kg, where it has a payload)."""
     links = [("base", 1.0, "0 0 0", 0.01), ("upper", 4.0, ".2 0 0", 0.05), ("fore", 2.0, ".15 0 0", 0.02)]
     joints = [("shoulder", "base", "upper", "0 0 0"), ("elbow", "upper", "fore", ".4 0 0")]
     if beside.idle:
@@ -216,7 +221,7 @@ def _robot(folder: Path, beside: Strange) -> Any:
         parts.append('<link name="floor"/>' + FIXED.format("mount", "floor", "base", "0 0 0", "0.5 0.3 0"))
     (folder / "robot.urdf").write_text(f'<robot name="two">{"".join(parts)}</robot>')
     if beside.payload:
-        parts.append(_link("load", 0.7, "0 0 0", 1e-9) + FIXED.format("grip", "fore", "load", ".3 0 .05", "0 0 0"))
+        parts.append(_link("load", load, "0 0 0", 1e-9) + FIXED.format("grip", "fore", "load", LOAD[1], "0 0 0"))
     model = mj.MjModel.from_xml_string(f'<robot name="two">{"".join(parts)}</robot>')
     model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_LIMIT | mj.mjtDisableBit.mjDSBL_CONTACT)
     return model
@@ -261,6 +266,26 @@ def _link(name: str, mass: float, com: str, moment: float) -> str:
     return f'<link name="{name}"><inertial><mass value="{mass}"/><origin xyz="{com}"/>{inertia}</inertial></link>'
 
 
+def _held(
+    folder: Path, what: str, rng: np.random.Generator, course: np.ndarray, motion: tuple[np.ndarray, ...]
+) -> np.ndarray:
+    """Torque (N m) of a body that is carried for a part of a recording, or of a push that rises and falls.
+
+    `course` is the share of the recording's time that has gone by.
+    """
+    if what == "pushed":
+        peak, width = rng.uniform(0.2, 0.8), rng.uniform(0.02, 0.05)
+        force = rng.uniform(10, 30) * np.exp(-(((course - peak) / width) ** 2))
+        q = motion[0]
+        reach = np.stack([0.4 * np.cos(q[:, 0]) + 0.3 * np.cos(q.sum(1)), 0.3 * np.cos(q.sum(1))], 1)
+        return force[:, None] * reach
+    start = rng.uniform(0.1, 0.5)
+    while_held = (course > start) & (course < start + rng.uniform(0.2, 0.4))
+    mass = LOAD[0] * rng.uniform(0.4, 2)
+    bare, loaded = (_robot(folder, beside, mass) for beside in (Strange(), Strange(payload=True)))
+    return (_inverse(loaded, *motion) - _inverse(bare, *motion))[:, :2] * while_held[:, None]
+
+
 def _inverse(model: Any, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     data, out = mj.MjData(model), np.empty((len(q), model.nv))
     data.qpos[2:] = 0.4  # of the wrist that never moves
@@ -286,11 +311,13 @@ def graded(seed: int, hidden: str, strange: bool = False) -> dict[str, Any]:
         return out | {"grade": "refused", "names": [], "text": text, "p": 1.0}
     assert isinstance(found, fj.Diagnosis)
     names = [f"{cause.name.effect} at {', '.join(cause.name.at)}" for cause in found.causes]
-    wrong = [n for n in names if hidden != "rotor" or n != "rotor_inertia at elbow"]
+    truth = {"rotor": "rotor_inertia at elbow", "carried": "payload at fore"}.get(hidden)
+    wrong = [name for name in names if name != truth]
     out |= {"grade": f"wrong ({found.verdict})" if wrong else found.verdict, "names": names, "p": found.p_value}
     if found.rest is not None:
         near = [f"{one.name.effect} at {', '.join(one.name.at)}: {one.why_not}" for one in found.rest.nearest]
         out |= {"text": found.rest.text, "relative": [float(x) for x in found.rest.relative], "nearest": near}
+    out["said"] = [cause.note for cause in found.causes]
     out |= {name: [float(x) for x in getattr(found, name)] for name in ("noise", "before", "after")}
     return out | {"notes": list(found.notes)}
 
@@ -298,7 +325,7 @@ def graded(seed: int, hidden: str, strange: bool = False) -> dict[str, Any]:
 def main() -> None:
     """Diagnose the cases in turn, a line each, and count the verdicts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("hidden", choices=["clean", "rotor", "foreign", "tooth"])
+    parser.add_argument("hidden", choices=["clean", "rotor", "foreign", "tooth", "carried", "pushed"])
     parser.add_argument("--seeds", nargs=2, type=int, default=[0, 20], metavar=("FIRST", "NUMBER"))
     parser.add_argument("--strange", action="store_true", help="with what a stranger's recording has beside")
     parser.add_argument("--out", type=Path, help="file to which all of each answer is added, a JSON line a case")

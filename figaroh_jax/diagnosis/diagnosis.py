@@ -25,13 +25,14 @@ from ..recordings.bandwidth import note_on
 from ..recordings.checks import checked_recordings, refuse_unmeasured
 from ..recordings.dataset import Recording, read_recordings
 from ..recordings.signals import Signals, kept_out_in_vain, stands_at_times
-from ..results import Cause, Diagnosis, Experiment, Name, Nearest, Rest, Verdict
+from ..results import Cause, Diagnosis, Experiment, Gain, Name, Nearest, Rest, Verdict
 from ..rigid.model import RobotModel, prismatic
 from ..simulators.contract import Backend
 from ..simulators.native import as_backend
 from ..simulators.registry import backend as make_backend
 from .answer_fit import as_moves, as_predicts_best, as_weighed_in_motion, as_weighed_otherwise, together
 from .believed import impossible_links
+from .carried import LOAD, Carried, carried_in_part, error_with, torque_of, with_loads, without_loads
 from .causes import UNSURE, searched_causes, told_size
 from .constancy import follows_own_motion, of_one_recording, recordings_that_differ
 from .estimates import estimates, fitted_model
@@ -155,15 +156,21 @@ def diagnose(
                     return other
             return one
 
+        loads = () if contradictions or LOAD in forbid else carried_in_part(*begun)
+        if loads:
+            signals = without_loads(backend.robot, signals, loads)
+            begun = begun_with(backend, signals, known, trust)
         zeros = () if contradictions else zeros_that_differ(*begun, tolerance)
-        answer = None
+        one, answer = None, None
         if zeros and EFFECT not in forbid:
             moved = shifted(signals, zeros)
             one = answer_to(moved, begun_with(backend, moved, known, trust))
             answer = _of_own_zeros(one, zeros, begun[0], [s.name for s in signals], forbid, tolerance)
-        if answer is None:
-            answer = answer_to(signals, begun).answer
-            answer = unexplained(answer, zeros, backend.robot.dof_names, [s.name for s in signals])
+        if one is None or answer is None:
+            one = answer_to(signals, begun)
+            answer = unexplained(one.answer, zeros, backend.robot.dof_names, [s.name for s in signals])
+        if loads:
+            answer = _with_loads(one._replace(answer=answer), loads, signals)
         cannot_be = [f"impossible: {text}" for text in answer.rest.contradicts if text not in contradictions]
         return replace(answer, band=band, notes=(*cannot_be, *answer.notes, *note_on(band)))
 
@@ -201,6 +208,27 @@ def _of_own_zeros(
         after = gain_of(here.problem, step, zeros).after
         holdout = replace(holdout, before=relative_error(problem, first), after=after)
     return replace(answer, before=residual_rms(problem, first.state), holdout=holdout)
+
+
+def _with_loads(one: _Answered, loads: Sequence[Carried], signals: Sequence[Signals]) -> Diagnosis:
+    """The answer to recordings without what the robot carries in part, with that as causes."""
+    answer, here, step = one
+    problem, links = here.problem, dict.fromkeys(load.link for load in loads)
+
+    def carrying(some: Sequence[Carried], state: State) -> tuple[Problem, Step]:
+        torque = problem.records.torque + sum(torque_of(problem, signals, load, load.body) for load in some)
+        seen = replace(problem, records=eqx.tree_at(lambda r: r.torque, problem.records, torque))
+        return seen, stand(seen, state, here.whitening)
+
+    gains = {}
+    for link in links:
+        own = [load for load in loads if load.link == link]
+        gains[link] = Gain(error_with(*carrying(own, step.state)), error_with(problem, step, signals, own))
+    answer = with_loads(answer, loads, gains, problem.model, signals)
+    (seen, first), holdout = carrying(loads, here.start), answer.holdout
+    if not problem.held.any():  # of recordings kept out no load is known
+        holdout = replace(holdout, before=error_with(seen, first), after=error_with(problem, step, signals, loads))
+    return replace(answer, before=residual_rms(seen, first.state), holdout=holdout)
 
 
 class _Judged(NamedTuple):
