@@ -6,6 +6,7 @@
     python benchmarks/conditions.py tooth --seeds 0 20     # a spot of a gear that is felt in one direction
     python benchmarks/conditions.py carried --seeds 0 20   # a body that is gripped and let go in each recording
     python benchmarks/conditions.py pushed --seeds 0 20    # a push at the forearm's tip, once in each recording
+    python benchmarks/conditions.py changed --seeds 0 20   # a joint's friction, gain or zero is another one for a while
     python benchmarks/conditions.py clean --strange        # with what a stranger's recording has beside
 
 The torques are MuJoCo C's inverse dynamics, with viscous and dry friction that the baseline fits. Drawn are: seconds,
@@ -187,6 +188,8 @@ def make(folder: Path, seed: int, hidden: str, strange: bool = False) -> tuple[C
             tau[:, 1] += 0.4 * tau[:, 1].std() * np.exp(-(((q[:, 1] - spot) / 0.06) ** 2)) * (v[:, 1] > 0)
         if hidden in ("carried", "pushed"):
             tau[:, :2] += _held(folder, hidden, np.random.default_rng((seed, 2, run)), t / told.seconds, (q, v, a))
+        if hidden == "changed":
+            _change(tau, v, np.random.default_rng((seed, 3)), np.random.default_rng((seed, 3, run)), t / told.seconds)
         tau[:, :2] += told.level * tau[:, :2].std(0) * noise(rng, len(t), told.colour)
         if beside.idle:
             q, v = (np.column_stack([x, value * np.ones(len(t))]) for x, value in ((q, 0.4), (v, 0.0)))
@@ -286,6 +289,17 @@ def _held(
     return (_inverse(loaded, *motion) - _inverse(bare, *motion))[:, :2] * while_held[:, None]
 
 
+def _change(
+    tau: np.ndarray, v: np.ndarray, of: np.random.Generator, rng: np.random.Generator, course: np.ndarray
+) -> None:
+    """Let a joint have another friction, gain or zero of its torque for a part of a recording."""
+    joint, what, size = int(of.integers(2)), of.choice(["friction", "gain", "zero"]), of.uniform(0.1, 0.5)
+    start = rng.uniform(0.1, 0.5)
+    there = (course > start) & (course < start + rng.uniform(0.2, 0.4))
+    own = {"friction": tau[:, joint].std() * np.sign(v[:, joint]), "gain": tau[:, joint], "zero": tau[:, joint].std()}
+    tau[:, joint] += size * own[str(what)] * there
+
+
 def _inverse(model: Any, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     data, out = mj.MjData(model), np.empty((len(q), model.nv))
     data.qpos[2:] = 0.4  # of the wrist that never moves
@@ -325,7 +339,7 @@ def graded(seed: int, hidden: str, strange: bool = False) -> dict[str, Any]:
 def main() -> None:
     """Diagnose the cases in turn, a line each, and count the verdicts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("hidden", choices=["clean", "rotor", "foreign", "tooth", "carried", "pushed"])
+    parser.add_argument("hidden", choices=["clean", "rotor", "foreign", "tooth", "carried", "pushed", "changed"])
     parser.add_argument("--seeds", nargs=2, type=int, default=[0, 20], metavar=("FIRST", "NUMBER"))
     parser.add_argument("--strange", action="store_true", help="with what a stranger's recording has beside")
     parser.add_argument("--out", type=Path, help="file to which all of each answer is added, a JSON line a case")

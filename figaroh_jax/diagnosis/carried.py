@@ -43,10 +43,12 @@ FEWEST_BLOCKS = 4  # of a stretch: its slices foretell each other
 RIDGE = 1e-4  # of a column's squares
 REACH = 0.3  # m, deviation of the centre of mass from the origin of its link as it is believed before
 LEAST_GAIN = 16.0  # squares that a body takes, those of the noise being 1
-T = 2.5  # of what the other slices foretell, over the blocks of a stretch
+T = 2.0  # of what the other slices foretell, over the blocks of a stretch
 FORETOLD = 0.5  # of the squares that are left in a stretch, at the joint where it is most
+SECOND = 0.1  # of the squares foretold, at the joint where they are most but one: else that joint alone has changed
 ALONE = 0.9  # of the squares that constants, friction and gains of the joints foretell, which are four numbers each
-BESIDE = 5.0  # times what a body of negative mass takes anywhere
+STILL = 0.3  # of the squares foretold, or beside the body these foretell so little
+BESIDE = 4.0  # times what a body of negative mass takes anywhere
 SETTLES = 0.2  # s beside either end: what is gripped weighs on the hand bit by bit
 ROUNDS, STEPS, STEADY = 3, 30, 1e-9
 REVERSAL = 0.05  # of a joint's RMS speed: half width in which friction turns
@@ -353,29 +355,48 @@ def _foretold(problem: Problem, step: Step, rows: _Rows, one: _Stretch) -> _Fore
     there, e = step.rows.y[:, one.here] != 0, rows.residual[:, one.here]
     before, left = there * e**2, there * (e - foretold) ** 2
     share = 1 - left.sum(1) / np.maximum(before.sum(1), 1e-300)
-    each = np.array([(before - left)[:, block == number].sum() for number in numbers])
-    t = each.mean() * np.sqrt(len(each)) / max(float(each.std(ddof=1)), 1e-300)
-    if not (share.max() > FORETOLD and t > T and min(body[0] for body in others) > 0):
+    joints = np.stack([(before - left)[:, block == number].sum(1) for number in numbers])
+    each = joints.sum(1)
+    t, second = _sure(each), int(np.argsort(joints.sum(0))[-2]) if joints.shape[1] > 1 else -1
+    if not (share.max() > FORETOLD and t > T and min(body[0] for body in others) > 0) or second < 0:
         return None
-    alone = _by_themselves(problem, step, e * there, one, slices)
-    if each.sum() < ALONE * (before - alone).sum():
+    if joints[:, second].sum() < SECOND * each.sum() or _sure(joints[:, second]) < T:
+        return None  # a change of one joint is as good
+    after = rows.residual.copy()
+    after[:, one.here] -= foretold
+    alone, still = (_by_themselves(problem, step, x, one) for x in (rows.residual, after))
+    if each.sum() < ALONE * alone and still > STILL * each.sum():
         return None
     return _Foretold(np.stack(others), slices, float(stdtr(len(each) - 1, -t)))
 
 
-def _by_themselves(
-    problem: Problem, step: Step, e: Float[np.ndarray, "nv rows"], one: _Stretch, slices: Int[np.ndarray, " rows"]
-) -> Float[np.ndarray, "nv rows"]:
-    """Squares that are left where each joint has a constant, a friction and a gain of its own in a stretch."""
-    n, samples, _, _ = problem.records.shape
-    at = (problem.records.row_samples() + samples * np.arange(n)[:, None]).reshape(-1)[one.here]
-    speed, torque = problem.motion.velocity[at].T, (step.rows.X @ step.state.theta)[:, one.here]
-    left = e.copy()
-    for joint, own in enumerate(e):
-        v, tau = (x / max(float(np.sqrt((x**2).mean())), 1e-300) for x in (speed[joint], torque[joint]))
-        F = np.stack([np.ones(len(v)), v, np.tanh(v / REVERSAL), tau], axis=1) * (own != 0)[:, None]
-        left[joint] -= foretold_by_others(own, F, slices)
-    return left**2
+def _sure(each: Float[np.ndarray, " blocks"]) -> float:
+    """Mean over its standard deviation, as blocks scatter."""
+    return float(each.mean() * np.sqrt(len(each)) / max(float(each.std(ddof=1)), 1e-300))
+
+
+def _by_themselves(problem: Problem, step: Step, residual: Float[np.ndarray, "nv T"], one: _Stretch) -> float:
+    """Squares that a constant, a friction and a gain of each joint foretell in a stretch, beyond those that they
+    foretell elsewhere in the recording: what they take of any stretch is a rest that the robot has always."""
+    n, samples, count, nv = problem.records.shape
+    sample = (problem.records.row_samples() + samples * np.arange(n)[:, None]).reshape(-1)
+    at, block, total = problem.records.spans[one.recording], step.rows.block, 0.0
+    first, torque = at.slot * count + at.row, step.rows.X @ step.state.theta
+    row = np.arange(first, first + at.rows)
+    row = row[block[row] >= 0]
+    inside = (row >= one.rows[0]) & (row < one.rows[1])
+    for joint in range(nv):
+        foretold = []
+        for here in (row[inside], row[~inside]):
+            here = here[step.rows.y[joint, here] != 0]
+            e, given = residual[joint, here], (problem.motion.velocity[sample[here], joint], torque[joint, here])
+            v, tau = (x / max(float(np.sqrt((x**2).sum() / max(len(x), 1))), 1e-300) for x in given)
+            F = np.stack([np.ones(len(v)), v, np.tanh(v / REVERSAL), tau], axis=1)
+            left = e - foretold_by_others(e, F, block[here] % FOLDS)
+            foretold.append((float((e**2).sum() - (left**2).sum()), len(here)))
+        (own, rows), (others, more) = foretold
+        total += max(0.0, own - max(0.0, others) * rows / max(more, 1))
+    return total
 
 
 def _told_of(problem: Problem, step: Step, rows: _Rows, one: _Stretch) -> Carried | None:
