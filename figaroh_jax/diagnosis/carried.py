@@ -35,6 +35,7 @@ from .step import Step
 __all__ = ["LOAD", "Carried", "carried_in_part", "error_with", "torque_of", "with_loads", "without_loads"]
 
 LOAD = "payload"
+MOST_OF_ALL = 0.75  # of a recording: a longer stretch is a recording that is unlike the others
 CELLS = 40  # of a recording, at whose edges stretches begin and end
 FINE = 33  # moments around an edge, up to those next to it, of which the best is taken
 MOST = 24  # stretches
@@ -48,7 +49,7 @@ FORETOLD = 0.5  # of the squares that are left in a stretch, at the joint where 
 SECOND = 0.1  # of the squares foretold, at the joint where they are most but one: else that joint alone has changed
 ALONE = 0.9  # of the squares that constants, friction and gains of the joints foretell, which are four numbers each
 STILL = 0.3  # of the squares foretold, or beside the body these foretell so little
-BESIDE = 4.0  # times what a body of negative mass takes anywhere
+BESIDE = 5.0  # times what a body of negative mass takes anywhere
 SETTLES = 0.2  # s beside either end: what is gripped weighs on the hand bit by bit
 ROUNDS, STEPS, STEADY = 3, 30, 1e-9
 REVERSAL = 0.05  # of a joint's RMS speed: half width in which friction turns
@@ -280,7 +281,7 @@ def _stretches(
         if count <= FEWEST_BLOCKS:
             continue
         a, b = np.triu_indices(len(edges), -(-FEWEST_BLOCKS * (len(edges) - 1) // count))
-        free = (a > 0) | (b < len(edges) - 1)
+        free = edges[b] - edges[a] < MOST_OF_ALL * (edges[-1] - edges[0])
         for one in known:
             if (one.recording, one.link) == (number, link):
                 free &= (edges[a] >= one.rows[1]) | (edges[b] <= one.rows[0])
@@ -326,7 +327,7 @@ def _of_none(
     for _, own in spans:
         edges, _ = _edges(block, own)
         a, b = np.triu_indices(len(edges), 1)
-        some = (a > 0) | (b < len(edges) - 1)
+        some = edges[b] - edges[a] < MOST_OF_ALL * (edges[-1] - edges[0])
         most = max(most, *(rows.sums(link, edges).best(a[some], b[some], -1)[1] for link in links))
     return most
 

@@ -156,9 +156,10 @@ def diagnose(
                     return other
             return one
 
-        loads = () if contradictions or LOAD in forbid else carried_in_part(*begun)
+        measured, may_carry = signals, not contradictions and LOAD not in forbid
+        loads = carried_in_part(*begun) if may_carry else ()
         if loads:
-            signals = without_loads(backend.robot, signals, loads)
+            signals = without_loads(backend.robot, measured, loads)
             begun = begun_with(backend, signals, known, trust)
         zeros = () if contradictions else zeros_that_differ(*begun, tolerance)
         one, answer = None, None
