@@ -35,7 +35,7 @@ from .step import Step
 __all__ = ["LOAD", "Carried", "carried_in_part", "error_with", "torque_of", "with_loads", "without_loads"]
 
 LOAD = "payload"
-MOST_OF_ALL = 0.75  # of a recording: a longer stretch is a recording that is unlike the others
+MOST_OF_ALL = 0.75  # of a recording: where a longer stretch is the best, all of it is unlike the others
 CELLS = 40  # of a recording, at whose edges stretches begin and end
 FINE = 33  # moments around an edge, up to those next to it, of which the best is taken
 MOST = 24  # stretches
@@ -281,13 +281,13 @@ def _stretches(
         if count <= FEWEST_BLOCKS:
             continue
         a, b = np.triu_indices(len(edges), -(-FEWEST_BLOCKS * (len(edges) - 1) // count))
-        free = edges[b] - edges[a] < MOST_OF_ALL * (edges[-1] - edges[0])
+        free = np.ones(len(a), bool)
         for one in known:
             if (one.recording, one.link) == (number, link):
                 free &= (edges[a] >= one.rows[1]) | (edges[b] <= one.rows[0])
         a, b = a[free], b[free]
         best, most = rows.sums(link, edges).best(a, b)
-        if not most > 0:
+        if not most > 0 or edges[b[best]] - edges[a[best]] > MOST_OF_ALL * (edges[-1] - edges[0]):
             continue
         ends = bool(a[best] > 0), bool(b[best] < len(edges) - 1)
         near = [_near(edges, k, inside) for k, inside in zip((a[best], b[best]), ends, strict=True)]
@@ -327,8 +327,7 @@ def _of_none(
     for _, own in spans:
         edges, _ = _edges(block, own)
         a, b = np.triu_indices(len(edges), 1)
-        some = edges[b] - edges[a] < MOST_OF_ALL * (edges[-1] - edges[0])
-        most = max(most, *(rows.sums(link, edges).best(a[some], b[some], -1)[1] for link in links))
+        most = max(most, *(rows.sums(link, edges).best(a, b, -1)[1] for link in links))
     return most
 
 
