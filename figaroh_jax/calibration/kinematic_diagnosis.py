@@ -383,10 +383,10 @@ def _posterior_mode(linear: marginal.Linear, noise, used, width) -> tuple[np.nda
     rows = np.flatnonzero(used)
     G = linear.jacobian[rows] / noise[rows, None]
     precision = np.where(linear.prior == marginal.FLAT, 1e-10, width**-2.0)
-    normal = G.T @ G + np.diag(precision)
-    covariance = np.linalg.inv(normal)
+    tall = np.vstack([G, np.diag(np.sqrt(precision))])  # rows may be all but exact: squares would lose the prior
+    root = np.linalg.inv(np.linalg.qr(tall, mode="r"))
     pull = G.T @ (linear.residual[rows] / noise[rows]) + precision * linear.at
-    return linear.at - covariance @ pull, covariance
+    return linear.at - root @ (root.T @ pull), root @ root.T
 
 
 def _simplest(scores: Scores) -> int:
