@@ -464,6 +464,10 @@ def with_loads(
     answer: Diagnosis, loads: Sequence[Carried], gains: dict[int, Gain], model: RobotModel, signals: Sequence[Signals]
 ) -> Diagnosis:
     """The answer to recordings `without_loads`, with the loads as causes, one of each link; `gains` are by link."""
+    if answer.rest.contradicts:  # nothing is named before that is settled
+        return replace(
+            answer, notes=(*answer.notes, f"a part of the torque looks like a load: {_when(loads, signals)}")
+        )
     causes = list(answer.causes)
     for link, gain in gains.items():
         own = [load for load in loads if load.link == link]
@@ -479,7 +483,7 @@ def with_loads(
         more = f"carried {note}; the extended model is without it: cut the recordings there and state its `load`"
         confidence = 1 - min(load.p_value for load in own)
         causes.append(Cause(name, numbers, confidence, gain, (), len(causes) + 1, more))
-    verdict: Verdict = {"nothing": "named", "unknown": "named+rest"}.get(answer.verdict, answer.verdict)  # pyright: ignore
+    verdict: Verdict = "named" if answer.verdict in ("nothing", "named") else "named+rest"
     causes.sort(key=lambda c: c.gain.after**2 - c.gain.before**2)
     p_value = min(answer.p_value, *(load.p_value for load in loads))
     return replace(answer, verdict=verdict, causes=tuple(causes), p_value=p_value)

@@ -156,22 +156,16 @@ def diagnose(
                     return other
             return one
 
-        measured, may_carry = signals, not contradictions and LOAD not in forbid
-        loads = carried_in_part(*begun) if may_carry else ()
+        def begun_anew(signals: Sequence[Signals]) -> tuple[Problem, State]:
+            return begun_with(backend, signals, known, trust)
+
+        loads = () if contradictions or LOAD in forbid else carried_in_part(*begun)
         if loads:
-            signals = without_loads(backend.robot, measured, loads)
-            begun = begun_with(backend, signals, known, trust)
+            signals = without_loads(backend.robot, signals, loads)
+            begun = begun_anew(signals)
         zeros = () if contradictions else zeros_that_differ(*begun, tolerance)
-        one, answer = None, None
-        if zeros and EFFECT not in forbid:
-            moved = shifted(signals, zeros)
-            one = answer_to(moved, begun_with(backend, moved, known, trust))
-            answer = _of_own_zeros(one, zeros, begun[0], [s.name for s in signals], forbid, tolerance)
-        if one is None or answer is None:
-            one = answer_to(signals, begun)
-            answer = unexplained(one.answer, zeros, backend.robot.dof_names, [s.name for s in signals])
-        if loads:
-            answer = _with_loads(one._replace(answer=answer), loads, signals)
+        one = _beside_zeros(answer_to, begun_anew, signals, begun, zeros, forbid, tolerance)
+        answer = _with_loads(one, loads, signals) if loads else one.answer
         cannot_be = [f"impossible: {text}" for text in answer.rest.contradicts if text not in contradictions]
         return replace(answer, band=band, notes=(*cannot_be, *answer.notes, *note_on(band)))
 
@@ -182,6 +176,27 @@ class _Answered(NamedTuple):
     answer: Diagnosis
     here: Setting
     step: Step
+
+
+def _beside_zeros(
+    answer_to: Callable[[Sequence[Signals], tuple[Problem, State]], _Answered],
+    begun_anew: Callable[[Sequence[Signals]], tuple[Problem, State]],
+    signals: Sequence[Signals],
+    begun: tuple[Problem, State],
+    zeros: Sequence[Zeros],
+    forbid: Sequence[str],
+    tolerance: float,
+) -> _Answered:
+    """The answer to recordings with the `zeros` that some of them have for themselves, named where they may be."""
+    names = [one.name for one in signals]
+    if zeros and EFFECT not in forbid:
+        moved = shifted(signals, zeros)
+        one = answer_to(moved, begun_anew(moved))
+        answer = _of_own_zeros(one, zeros, begun[0], names, forbid, tolerance)
+        if answer is not None:
+            return one._replace(answer=answer)
+    one = answer_to(signals, begun)
+    return one._replace(answer=unexplained(one.answer, zeros, one.here.problem.model.dof_names, names))
 
 
 def _of_own_zeros(
