@@ -480,7 +480,8 @@ def with_loads(
         units = ("kg", "m", "m", "m")
         each = zip(("mass", "com_x", "com_y", "com_z"), best.body, best.deviation, units, strict=True)
         numbers = {key: Estimate(float(value), float(std), unit) for key, value, std, unit in each}
-        more = f"carried {note}; the extended model is without it: cut the recordings there and state its `load`"
+        which = f"; the numbers are those of {signals[best.recording].name}" if len(own) > 1 else ""
+        more = f"carried {note}{which}; the extended model is without it: cut the recordings there and state its `load`"
         confidence = 1 - min(load.p_value for load in own)
         causes.append(Cause(name, numbers, confidence, gain, (), len(causes) + 1, more))
     verdict: Verdict = "named" if answer.verdict in ("nothing", "named") else "named+rest"
