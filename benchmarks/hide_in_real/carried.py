@@ -20,15 +20,14 @@ from typing import Any
 
 import numpy as np
 
-import figaroh_jax as fj
-
 from .. import blackbox
 from .generate import twin_of
 from .motion import Scene, scene_of
 from .recordings import SETS, RealSet
 
 SETTLES = 0.15  # s
-TOLD = re.compile(r"in (\S+)(?: from ([\d.-]+) s)?(?: on| up)?(?: to ([\d.-]+) s)?, ([\d.e-]+) \+- ([\d.e-]+) kg")
+LIMIT = 1800  # s of one call
+TOLD = re.compile(r"in (\S+) from ([\d.-]+) s to ([\d.-]+) s, ([\d.e-]+) \+- ([\d.e-]+) kg")
 NEAR, SIZED = 0.5, 0.15  # s, and share of the mass: as it is told and as it was made
 
 
@@ -83,25 +82,32 @@ def _added(real: RealSet, scenes: list[Scene], seed: int, size: float) -> tuple[
     return out, told
 
 
-def _diagnosed(folder: Path, case: dict[str, Any], forbid: bool) -> fj.Diagnosis:
-    with tempfile.TemporaryDirectory() as scratch:
-        path = blackbox.write_task(folder, Path(scratch), case, ["payload"] if forbid else [])
-        found = fj.diagnose_task(fj.load_task(path))
-    assert isinstance(found, fj.Diagnosis)
-    return found
+def _diagnosed(folder: Path, case: dict[str, Any], forbid: bool) -> dict[str, Any]:
+    """The answer of the command line."""
+    job = blackbox.Job(case["name"], ("payload",) if forbid else ())
+    with tempfile.TemporaryDirectory() as out:
+        said = blackbox.call_tool(folder, Path(out), case, job, blackbox.default_command(), LIMIT)
+        answer = blackbox.read(Path(out) / job.folder)
+    if answer is None:
+        raise SystemExit(said)
+    return answer
 
 
-def _names(found: fj.Diagnosis) -> list[str]:
-    return [str(cause.name) for cause in found.causes]
+def _names(answer: dict[str, Any]) -> list[str]:
+    return [_name(cause) for cause in answer["causes"]]
 
 
-def _graded(found: fj.Diagnosis, before: list[str], stretches: dict[str, Any]) -> tuple[str, str]:
+def _name(cause: dict[str, Any]) -> str:
+    return f"{cause['effect']} ({', '.join(cause['at'])})"
+
+
+def _graded(answer: dict[str, Any], before: list[str], stretches: dict[str, Any]) -> tuple[str, str]:
     """In a word, and in words."""
-    new = [cause for cause in found.causes if str(cause.name) not in before]
-    loads = [cause for cause in new if cause.name.effect == "payload" and "carried" in cause.note]
-    said = {name: tuple(map(float, numbers)) for name, *numbers in TOLD.findall(loads[0].note)} if loads else {}
-    line = f"new {[str(cause.name) for cause in new]}"
-    line += f", gone {[name for name in before if name not in _names(found)]}, {found.verdict}; "
+    new = [cause for cause in answer["causes"] if _name(cause) not in before]
+    loads = [cause for cause in new if cause["effect"] == "payload" and "carried" in cause.get("note", "")]
+    said = {name: tuple(map(float, numbers)) for name, *numbers in TOLD.findall(loads[0]["note"])} if loads else {}
+    line = f"new {[_name(cause) for cause in new]}"
+    line += f", gone {[name for name in before if name not in _names(answer)]}, {answer['verdict']}; "
     right = bool(said) and len(new) == len(loads) == 1
     for name, (begins, ends, mass) in stretches.items():
         line += f"{name} {begins:.2f} to {ends:.2f} s, {mass:.3g} kg: "
@@ -112,7 +118,7 @@ def _graded(found: fj.Diagnosis, before: list[str], stretches: dict[str, Any]) -
         right &= abs(b - begins) < NEAR and abs(e - ends) < NEAR and abs(m - mass) < max(SIZED * mass, 1.5 * d)
         line += f"{b:.2f} to {e:.2f} s, {m:.3g} +- {d:.2g} kg; "
     right &= all(name in stretches for name in said)
-    word = "right" if right else "wrong" if new and len(new) != len(loads) else "other numbers" if loads else "silent"
+    word = "right" if right else "wrong" if len(new) != len(loads) else "other numbers" if loads else "silent"
     return word, line
 
 
