@@ -15,7 +15,6 @@ from generators.inverse import make_case
 import figaroh_jax as fj
 from benchmarks.conditions import graded, make
 from figaroh_jax.diagnosis.carried import _parameters, _slopes
-from figaroh_jax.reporting import answer
 
 TOLD = re.compile(r"in (\d) from ([\d.]+) s to ([\d.]+) s, ([\d.]+) \+- ([\d.e-]+) kg")
 
@@ -36,7 +35,7 @@ def test_what_is_gripped_and_let_go_is_timed_and_weighed(seed: int):
     assert isinstance(found, fj.Diagnosis)
     (cause,) = found.causes
     assert (found.verdict, cause.name.effect, cause.name.at) == ("named", "payload", ("fore",))
-    assert answer.cause(cause)["note"] == cause.note
+    assert f"payload at fore is {cause.note}" in found.notes  # which answer.json has
     stretches = TOLD.findall(cause.note)
     assert len(stretches) == told.recordings
     for run, *numbers in stretches:

@@ -104,8 +104,9 @@ def _name(cause: dict[str, Any]) -> str:
 def _graded(answer: dict[str, Any], before: list[str], stretches: dict[str, Any]) -> tuple[str, str]:
     """In a word, and in words."""
     new = [cause for cause in answer["causes"] if _name(cause) not in before]
-    loads = [cause for cause in new if cause["effect"] == "payload" and "carried" in cause.get("note", "")]
-    said = {name: tuple(map(float, numbers)) for name, *numbers in TOLD.findall(loads[0]["note"])} if loads else {}
+    notes = [note for note in answer["notes"] if note.startswith("payload at") and "carried" in note]
+    loads = [cause for cause in new if cause["effect"] == "payload" and notes]
+    said = {name: tuple(map(float, numbers)) for name, *numbers in TOLD.findall(notes[0])} if loads else {}
     line = f"new {[_name(cause) for cause in new]}"
     line += f", gone {[name for name in before if name not in _names(answer)]}, {answer['verdict']}; "
     right = bool(said) and len(new) == len(loads) == 1

@@ -468,13 +468,14 @@ def with_loads(
         return replace(
             answer, notes=(*answer.notes, f"a part of the torque looks like a load: {_when(loads, signals)}")
         )
-    causes = list(answer.causes)
+    causes, notes = list(answer.causes), list(answer.notes)
     for link, gain in gains.items():
         own = [load for load in loads if load.link == link]
         name, note = Name(LOAD, (model.link_names[link],)), _when(own, signals)
         same = next((k for k, cause in enumerate(causes) if cause.name == name), None)
         if same is not None:  # a load of all recordings, beside which these are more
             causes[same] = replace(causes[same], note=f"{causes[same].note}; more of it {note}".removeprefix("; "))
+            notes.append(f"{LOAD} at {name.at[0]}: more of it {note}")
             continue
         best = min(own, key=lambda load: load.deviation[0] / load.body[0])
         units = ("kg", "m", "m", "m")
@@ -482,12 +483,13 @@ def with_loads(
         numbers = {key: Estimate(float(value), float(std), unit) for key, value, std, unit in each}
         which = f"; the numbers are those of {signals[best.recording].name}" if len(own) > 1 else ""
         more = f"carried {note}{which}; the extended model is without it: cut the recordings there and state its `load`"
+        notes.append(f"{LOAD} at {name.at[0]} is {more}")
         confidence = 1 - min(load.p_value for load in own)
         causes.append(Cause(name, numbers, confidence, gain, (), len(causes) + 1, more))
     verdict: Verdict = "named" if answer.verdict in ("nothing", "named") else "named+rest"
     causes.sort(key=lambda c: c.gain.after**2 - c.gain.before**2)
     p_value = min(answer.p_value, *(load.p_value for load in loads))
-    return replace(answer, verdict=verdict, causes=tuple(causes), p_value=p_value)
+    return replace(answer, verdict=verdict, causes=tuple(causes), p_value=p_value, notes=tuple(notes))
 
 
 def _when(loads: Sequence[Carried], signals: Sequence[Signals]) -> str:

@@ -85,7 +85,6 @@ def cause(found: Cause) -> dict[str, Any]:
         "confidence": finite(found.confidence),
         "gain": _gain(found.gain),
         "ambiguous_with": [_name(other) for other in found.ambiguous_with],
-        **({"note": found.note} if found.note else {}),
     }
 
 
